@@ -1,0 +1,1 @@
+//! Trajectory data sets on disk: shards in, published Parquet out

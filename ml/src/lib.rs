@@ -1,0 +1,1 @@
+//! SLIDE networks: windows, training, evaluation, prediction

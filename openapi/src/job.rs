@@ -1,0 +1,304 @@
+//! What a user asks for: a job of random runs of one machine, and what to learn from it.
+//!
+//! Units are in the names. Absent keys take the defaults documented here; unknown keys are refused.
+
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use utoipa::ToSchema;
+
+/// A batch of simulated runs, and optionally the networks to train on them.
+///
+/// A run is a pure function of (`seed`, run index) and this specification.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct JobSpec {
+    /// A title for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub title: Option<String>,
+    /// Built-in machine by name, or a machine file's text (TOML).
+    #[serde(default = "default_machine")]
+    pub machine: MachineRef,
+    /// Number of runs.
+    pub runs: u64,
+    /// Seed of every random choice.
+    #[serde(default)]
+    pub seed: u64,
+    /// Length of a run.
+    #[serde(default = "default_duration_s")]
+    pub duration_s: f64,
+    /// Time between samples; the valve signal is piecewise linear between them.
+    #[serde(default = "default_sample_time_s")]
+    pub sample_time_s: f64,
+    /// Payload: a value, or a range from which each run draws uniformly.
+    #[serde(default = "default_payload")]
+    pub payload_kg: ValueOrRange,
+    /// Ranges of the initial angles by name (`{"lift": [-10, 50]}`); default: the machine's.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub initial_angle_deg: BTreeMap<String, [f64; 2]>,
+    /// Valve signal of every cylinder.
+    #[serde(default)]
+    pub excitation: Excitation,
+    /// How runs are divided.
+    #[serde(default)]
+    pub split: Split,
+    /// Time integration.
+    #[serde(default)]
+    pub integrator: Integrator,
+    /// Flags whose runs are kept in the data set but not trained on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub exclude_flags: Vec<RunFlag>,
+    /// Sample type of the published files.
+    #[serde(default)]
+    pub sample_type: SampleType,
+    /// Extra runs with the test signal, from which the SLIDE window follows; not counted in `runs`.
+    #[serde(default = "default_settling_runs")]
+    pub settling_runs: u64,
+    /// Networks to train when the data set is published.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub train: Vec<TrainingSpec>,
+}
+
+fn default_machine() -> MachineRef {
+    MachineRef::BuiltIn("lift-boom".to_owned())
+}
+fn default_duration_s() -> f64 {
+    1.0
+}
+fn default_sample_time_s() -> f64 {
+    0.005
+}
+fn default_payload() -> ValueOrRange {
+    ValueOrRange::Value(0.0)
+}
+fn default_settling_runs() -> u64 {
+    8
+}
+
+/// Which machine.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum MachineRef {
+    /// A machine that the binary carries.
+    BuiltIn(String),
+    /// A machine file as text.
+    Inline {
+        /// TOML text.
+        toml: String,
+    },
+}
+
+/// A number, or a range `{"min": a, "max": b}`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum ValueOrRange {
+    /// The same for every run.
+    Value(f64),
+    /// Uniform in `[min, max]`.
+    Range {
+        /// Smallest value.
+        min: f64,
+        /// Largest value.
+        max: f64,
+    },
+}
+
+/// Commanded valve signal of a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Excitation {
+    /// The paper's random signal: 20 % of the samples each at +1, −1, 0, random linear ramps and
+    /// uniform noise; segments shuffled, then a few samples swapped.
+    #[default]
+    Random,
+    /// The settling test: open for a part of the run, then shut.
+    OpenThenShut {
+        /// Part of the run during which the valve is open, in (0, 1).
+        #[serde(default = "default_open_part")]
+        open_part: f64,
+    },
+    /// The published evaluation cycle: steps 0, +1, 0, −1 and trapezoids, stretched to the run.
+    Cycle,
+    /// Given values, one list per cylinder, one value per sample.
+    Given {
+        /// Valve values in [−1, 1] by cylinder name.
+        valve_ratio: BTreeMap<String, Vec<f64>>,
+    },
+}
+
+fn default_open_part() -> f64 {
+    0.2
+}
+
+/// Parts of the runs, by whole runs; must sum to 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Split {
+    /// Training part.
+    pub train: f64,
+    /// Validation part.
+    pub validation: f64,
+    /// Test part.
+    #[serde(default)]
+    pub test: f64,
+}
+
+impl Default for Split {
+    fn default() -> Self {
+        Self {
+            train: 0.8,
+            validation: 0.2,
+            test: 0.0,
+        }
+    }
+}
+
+/// Time integration.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Integrator {
+    /// Error-controlled; every channel but accelerations within 1e-3 of converged.
+    #[default]
+    Accurate,
+    /// The published scripts' scheme: Newmark β = 1/4, γ = 1/2 with velocity-level constraints.
+    TrapezoidalIndex2 {
+        /// Step.
+        #[serde(default = "default_sample_time_s")]
+        step_s: f64,
+    },
+    /// Generalised-α with spectral radius 0.7 and position-level constraints.
+    GeneralizedAlpha {
+        /// Step.
+        #[serde(default = "default_sample_time_s")]
+        step_s: f64,
+    },
+}
+
+/// What a run met on its way. A flagged run is valid data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RunFlag {
+    /// The valve was held shut by the stroke cut-off.
+    StrokeCutoff,
+    /// The piston touched an end stop, or left the barrel where the machine has none.
+    EndStop,
+    /// A chamber reached vapour pressure (without a floor: zero).
+    Cavitation,
+    /// A chamber fell below tank pressure.
+    BelowTankPressure,
+    /// A chamber rose above supply pressure.
+    AboveSupplyPressure,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RunStatus {
+    /// Samples are in the data set.
+    Ok,
+    /// No samples: the solver did not converge or a number was not finite.
+    Failed,
+}
+
+/// Type of samples in published files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SampleType {
+    /// 64-bit.
+    #[default]
+    Float64,
+    /// 32-bit.
+    Float32,
+}
+
+/// How the length of the SLIDE window is found.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+pub enum WindowRule {
+    /// Last time the deflection is outside 5 % of its range around its final value, counted from
+    /// the closing of the valve; mean over the settling runs.
+    #[default]
+    Band,
+    /// The paper's rule: first time after which the deflection stays below 1.05 times its mean for
+    /// a tenth of the record, mean over the settling runs.
+    Paper,
+    /// From the damped eigenvalues of the machine, oil included: time to decay to 1 %.
+    Eigenvalues,
+    /// Given.
+    Given {
+        /// Window.
+        window_s: f64,
+    },
+}
+
+/// A network to train.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingSpec {
+    /// `best` (our default: least squares on the window plus a network for the rest), or the
+    /// paper's letters: `L`, `RLR`, `TLTLT`, `TLSLTLSLT`, `ELE`, …
+    #[serde(default = "default_structure")]
+    pub structure: String,
+    /// Channels in; default: valve, length, velocity and both pressures of every cylinder.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub inputs: Vec<String>,
+    /// Channels out; default: every structural channel except out-of-plane and axial deflection.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub targets: Vec<String>,
+    /// Length of the window.
+    #[serde(default)]
+    pub window: WindowRule,
+    /// Width of the hidden layers; default: the number of window steps.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub width: Option<usize>,
+    /// Seed of initial weights and batches.
+    #[serde(default)]
+    pub seed: u64,
+    /// Largest number of epochs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<usize>,
+    /// Largest training time; the schedule fits into it. Not reproducible to the byte.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub time_limit_s: Option<f64>,
+    /// Adam's learning rate at the start.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learning_rate: Option<f64>,
+    /// Windows per batch.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub batch: Option<usize>,
+    /// All overlapping windows (default), or the disjoint ones of the published scripts.
+    #[serde(default)]
+    pub windows: WindowCut,
+}
+
+fn default_structure() -> String {
+    "best".to_owned()
+}
+
+impl Default for TrainingSpec {
+    fn default() -> Self {
+        Self {
+            structure: default_structure(),
+            inputs: Vec::new(),
+            targets: Vec::new(),
+            window: WindowRule::default(),
+            width: None,
+            seed: 0,
+            epochs: None,
+            time_limit_s: None,
+            learning_rate: None,
+            batch: None,
+            windows: WindowCut::default(),
+        }
+    }
+}
+
+/// Which windows of a run are trained on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum WindowCut {
+    /// Every window.
+    #[default]
+    Overlapping,
+    /// floor(n / window) windows per run, as published.
+    Disjoint,
+}

@@ -1,0 +1,9 @@
+//! The contract of hydroflex: what is sent and stored. No numerics and no I/O.
+//!
+//! Every type here is a plain description with units in its field names. What is *true* about a
+//! description (does the mesh exist, is the stiffness regular, can the loop close) is decided in
+//! `hydroflex-sim` and `hydroflex-ml`, which convert these types once, at the edge.
+
+pub mod machine;
+pub mod channel;
+pub mod job;

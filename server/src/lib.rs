@@ -1,0 +1,3 @@
+//! The hydroflex service: coordinator, REST interface, predictions, and the command line around them.
+
+pub mod commands;

@@ -1,0 +1,66 @@
+//! The `hydroflex` binary: arguments, wiring, exit status.
+
+use clap::{Parser, Subcommand};
+use hydroflex_server::commands;
+
+/// Real-time structural estimation for hydraulically driven flexible booms: simulate, store, train, predict.
+#[derive(Parser)]
+#[command(name = "hydroflex", version, about, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run the whole chain on the built-in boom: simulate, train, evaluate, draw, then serve
+    Demo(commands::demo::Args),
+    /// Start the coordinator with its REST interface, and local workers
+    Serve(commands::serve::Args),
+    /// Start one worker that pulls shards from a coordinator's database
+    Worker(commands::worker::Args),
+    /// Simulate the runs of a table and write a data set
+    Simulate(commands::simulate::Args),
+    /// Inspect machine files
+    #[command(subcommand)]
+    Machine(commands::machine::Command),
+    /// Submit and follow jobs of a running service
+    #[command(subcommand)]
+    Job(commands::job::Command),
+    /// Download data sets from a running service
+    #[command(subcommand)]
+    Dataset(commands::dataset::Command),
+    /// Train a network on a data set
+    Train(commands::train::Args),
+    /// Evaluate a model on a data set it has not seen
+    Evaluate(commands::evaluate::Args),
+    /// List the models of a running service
+    #[command(subcommand)]
+    Model(commands::model::Command),
+    /// Estimate deflection, strain and stress from recorded sensor signals
+    Predict(commands::predict::Args),
+}
+
+fn main() -> std::process::ExitCode {
+    let cli = Cli::parse();
+    let result = match cli.command {
+        Command::Demo(args) => commands::demo::run(args),
+        Command::Serve(args) => commands::serve::run(args),
+        Command::Worker(args) => commands::worker::run(args),
+        Command::Simulate(args) => commands::simulate::run(args),
+        Command::Machine(command) => commands::machine::run(command),
+        Command::Job(command) => commands::job::run(command),
+        Command::Dataset(command) => commands::dataset::run(command),
+        Command::Train(args) => commands::train::run(args),
+        Command::Evaluate(args) => commands::evaluate::run(args),
+        Command::Model(command) => commands::model::run(command),
+        Command::Predict(args) => commands::predict::run(args),
+    };
+    match result {
+        Ok(()) => std::process::ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            std::process::ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! The worker: begin, simulate, put, commit
