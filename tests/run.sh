@@ -1,0 +1,55 @@
+#!/usr/bin/env bash
+# All tests: format, Rust tests, then the tools that people open our files with (Python, in a
+# virtual environment made here). Needs the Rust toolchain and python3; installs the rest below target/.
+#
+#   tests/run.sh             everything
+#   tests/run.sh --rust      Rust only: no Python
+#
+# HYDROFLEX_REFERENCE=DIR adds the comparison with an independent solver's trajectories,
+# HYDROFLEX_ACCEPTANCE=DIR the script that judges them.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+rust_only=false
+for argument in "$@"; do
+    case "$argument" in
+        --rust) rust_only=true ;;
+        *) echo "unknown argument: $argument (allowed: --rust)" >&2; exit 2 ;;
+    esac
+done
+
+say() { printf '\n== %s\n' "$*"; }
+passed=0
+failed=0
+count() { # passed failed
+    passed=$((passed + $1))
+    failed=$((failed + $2))
+}
+
+say "format"
+cargo fmt --all --check
+
+say "Rust tests (they share the build of every dependency with 'cargo run --release')"
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+set +e
+cargo test --release --workspace --no-fail-fast 2>&1 | tee "$log"
+rust_status=${PIPESTATUS[0]}
+set -e
+count $(awk '/^test result:/ { for (i = 1; i < NF; i++) { if ($(i+1) ~ /^passed/) p += $i; if ($(i+1) ~ /^failed/) f += $i } } END { print p+0, f+0 }' "$log")
+# A crate that does not compile reports no result line: the exit status still counts.
+if [ "$rust_status" -ne 0 ] && [ "$failed" -eq 0 ]; then count 0 1; fi
+
+if ! $rust_only; then
+    say "tools people use (Python)"
+    venv=target/test-venv
+    if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
+    "$venv/bin/pip" install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+    cargo build --release --bin hydroflex
+    for script in tests/python/test_*.py; do
+        say "$script"
+        if HYDROFLEX_BIN="$PWD/target/release/hydroflex" "$venv/bin/python" "$script"; then count 1 0; else count 0 1; fi
+    done
+fi
+
+printf '\n%d passed, %d failed\n' "$passed" "$failed"
+[ "$failed" -eq 0 ]
