@@ -7,3 +7,9 @@
 pub mod machine;
 pub mod channel;
 pub mod job;
+pub mod id;
+pub mod status;
+pub mod event;
+pub mod catalogue;
+pub mod prediction;
+pub mod problem;

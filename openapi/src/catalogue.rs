@@ -1,0 +1,104 @@
+//! What a service holds: data sets, models, machines.
+
+use crate::id::{DatasetId, JobId, ModelId, TrainingId};
+use crate::job::{JobSpec, TrainingSpec};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// A file of a data set or model.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct FileEntry {
+    /// Path inside the folder, `/` between its parts: `data/train-00000-of-00001.parquet`.
+    pub path: String,
+    /// Size.
+    pub size_bytes: u64,
+    /// SHA-256, 64 hexadecimal digits; also the strong ETag.
+    pub sha256: String,
+}
+
+/// A published data set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DatasetInfo {
+    /// Identifier: the first half of `dataset_sha256`.
+    pub dataset_id: DatasetId,
+    /// SHA-256 of the data set's `SHA256SUMS`.
+    pub dataset_sha256: String,
+    /// Runs, failed ones included.
+    pub runs: u64,
+    /// Size of all files.
+    pub size_bytes: u64,
+    /// What it was made from.
+    pub spec: JobSpec,
+    /// The first job that made it.
+    pub job_id: JobId,
+    /// When it was first published (RFC 3339, UTC).
+    pub created_at: String,
+    /// Files.
+    pub files: Vec<FileEntry>,
+}
+
+/// Data sets, newest first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DatasetPage {
+    /// Data sets.
+    pub datasets: Vec<DatasetInfo>,
+    /// Ask with this `cursor` for the next page; absent on the last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next_cursor: Option<String>,
+}
+
+/// A trained model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ModelInfo {
+    /// Identifier: the first half of `model_sha256`.
+    pub model_id: ModelId,
+    /// SHA-256 over its files.
+    pub model_sha256: String,
+    /// The training that made it.
+    pub training_id: TrainingId,
+    /// The data set it learned from.
+    pub dataset_id: DatasetId,
+    /// What was asked for.
+    pub spec: TrainingSpec,
+    /// Errors on the data set's validation runs, per target, in the target's unit.
+    #[schema(value_type = Object)]
+    pub metrics: serde_json::Value,
+    /// When it was registered (RFC 3339, UTC).
+    pub created_at: String,
+    /// Files.
+    pub files: Vec<FileEntry>,
+}
+
+/// Models, newest first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ModelPage {
+    /// Models.
+    pub models: Vec<ModelInfo>,
+    /// Ask with this `cursor` for the next page; absent on the last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next_cursor: Option<String>,
+}
+
+/// A machine that the service carries.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct MachineInfo {
+    /// Name, as a job gives it.
+    pub name: String,
+    /// In words.
+    pub description: String,
+    /// Names of its cylinders.
+    pub cylinders: Vec<String>,
+    /// Names of its angles.
+    pub angles: Vec<String>,
+    /// False if its mesh must be given and the service cannot simulate it.
+    pub available: bool,
+    /// The machine file.
+    pub toml: String,
+}
+
+/// Machines that the service carries.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct MachineList {
+    /// Machines.
+    pub machines: Vec<MachineInfo>,
+}

@@ -1,0 +1,47 @@
+//! Estimates over HTTP, in engineering units.
+
+use crate::id::{DatasetId, ModelId};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use utoipa::ToSchema;
+
+/// Recorded sensor signals. Every input of the model by its column name, with its unit in the name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PredictRequest {
+    /// Signals; all of one length, at least one window, one value per sample of the model.
+    #[schema(example = json!({"valve_lift_ratio": 0.0, "length_lift_m": 1.0}))]
+    pub inputs: BTreeMap<String, Signal>,
+    /// Time between samples, if the caller wants it checked against the model's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sample_time_s: Option<f64>,
+}
+
+/// A signal: values over time, or one value for a signal that does not change.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum Signal {
+    /// The same value for all samples. If every input is constant, one window of them is meant.
+    Constant(f64),
+    /// One value per sample.
+    Samples(Vec<f64>),
+}
+
+/// Estimates: one per sample from the end of the first window on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PredictResponse {
+    /// The model that made them.
+    pub model_id: ModelId,
+    /// The data set it learned from.
+    pub dataset_id: DatasetId,
+    /// Time between estimates.
+    pub sample_time_s: f64,
+    /// Samples in a window.
+    pub window_steps: u64,
+    /// Sample to which the first estimate belongs, counted from 0.
+    pub first_step: u64,
+    /// Number of estimates.
+    pub count: u64,
+    /// Estimates by column name, in the unit of the name.
+    pub estimates: BTreeMap<String, Vec<f64>>,
+}

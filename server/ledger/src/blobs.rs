@@ -1,0 +1,229 @@
+//! Objects in a directory or an object store: shards, data sets, models.
+//!
+//! ```text
+//! shards/JOB/…-eEPOCH.parquet   private; created once, never replaced, deleted when the job is over
+//! datasets/ID/…   models/ID/…   addressed by content; visible once the ledger lists them
+//! ```
+
+use bytes::Bytes;
+use futures::stream::{BoxStream, StreamExt, TryStreamExt};
+use object_store::local::LocalFileSystem;
+use object_store::path::Path as Key;
+use object_store::{GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
+use sha2::{Digest, Sha256};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Why the store did not answer.
+#[derive(Debug, thiserror::Error)]
+pub enum BlobError {
+    /// The URL names no store that we know.
+    #[error("a store URL begins with file:///, not {scheme:?}")]
+    UnknownStore {
+        /// Text before the first colon.
+        scheme: String,
+    },
+    /// The store refused, or could not be reached.
+    #[error("store: {0}")]
+    Store(#[from] object_store::Error),
+    /// A local file could not be read or written.
+    #[error("{path}: {source}")]
+    File {
+        /// File.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// An object is not what was put.
+    #[error("object {key} has SHA-256 {found}, expected {expected}")]
+    Damaged {
+        /// Object.
+        key: String,
+        /// Hash found.
+        found: String,
+        /// Hash recorded.
+        expected: String,
+    },
+}
+
+/// A place for objects.
+#[derive(Clone)]
+pub struct Blobs {
+    store: Arc<dyn ObjectStore>,
+    root: Option<PathBuf>,
+}
+
+impl Blobs {
+    /// Opens the store with this URL: `file:///absolute/path` (made if absent).
+    ///
+    /// # Errors
+    /// Refuses unknown stores; passes on what the file system says.
+    pub fn open(url: &str) -> Result<Self, BlobError> {
+        match url.strip_prefix("file://") {
+            Some(path) if path.starts_with('/') => Self::directory(Path::new(path)),
+            _ => Err(BlobError::UnknownStore {
+                scheme: url.split(':').next().unwrap_or_default().to_owned(),
+            }),
+        }
+    }
+
+    /// A directory of this machine. Puts are flushed to the disk before they count.
+    ///
+    /// # Errors
+    /// Passes on what the file system says.
+    pub fn directory(root: &Path) -> Result<Self, BlobError> {
+        std::fs::create_dir_all(root).map_err(|source| BlobError::File {
+            path: root.to_owned(),
+            source,
+        })?;
+        let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
+        Ok(Self {
+            store: Arc::new(store),
+            root: Some(root.to_owned()),
+        })
+    }
+
+    /// The directory that holds the objects below a key, if they are files of this machine.
+    #[must_use]
+    pub fn local_path(&self, key: &str) -> Option<PathBuf> {
+        self.root.as_ref().map(|root| root.join(key))
+    }
+
+    /// Puts an object that does not exist yet.
+    ///
+    /// # Errors
+    /// Refuses if it does; passes on what the store says.
+    pub async fn create(&self, key: &str, content: Bytes) -> Result<(), BlobError> {
+        let options = PutOptions {
+            mode: PutMode::Create,
+            ..PutOptions::default()
+        };
+        self.store
+            .put_opts(&Key::from(key), PutPayload::from_bytes(content), options)
+            .await?;
+        Ok(())
+    }
+
+    /// Puts a local file under a key addressed by content: replacing it changes nothing.
+    ///
+    /// # Errors
+    /// Passes on what the file system and the store say.
+    pub async fn upload(&self, file: &Path, key: &str) -> Result<(), BlobError> {
+        const PART_BYTES: usize = 8 << 20;
+        let broken = |source| BlobError::File {
+            path: file.to_owned(),
+            source,
+        };
+        let mut reader = tokio::fs::File::open(file).await.map_err(broken)?;
+        let size = reader.metadata().await.map_err(broken)?.len();
+        let key = Key::from(key);
+        if size <= PART_BYTES as u64 {
+            let content = tokio::fs::read(file).await.map_err(broken)?;
+            self.store.put(&key, PutPayload::from(content)).await?;
+            return Ok(());
+        }
+        let upload = self.store.put_multipart(&key).await?;
+        let mut writer = object_store::WriteMultipart::new_with_chunk_size(upload, PART_BYTES);
+        loop {
+            let mut part = vec![0; PART_BYTES];
+            let read = tokio::io::AsyncReadExt::read(&mut reader, &mut part)
+                .await
+                .map_err(broken)?;
+            if read == 0 {
+                break;
+            }
+            writer.wait_for_capacity(4).await?;
+            writer.write(&part[..read]);
+        }
+        writer.finish().await?;
+        Ok(())
+    }
+
+    /// Reads a whole object and checks its hash.
+    ///
+    /// # Errors
+    /// [`BlobError::Damaged`] if it is not what was put; what the store says.
+    pub async fn read(&self, key: &str, sha256: &str) -> Result<Bytes, BlobError> {
+        let content = self.store.get(&Key::from(key)).await?.bytes().await?;
+        let found = hex::encode(Sha256::digest(&content));
+        if found == sha256 {
+            Ok(content)
+        } else {
+            Err(BlobError::Damaged {
+                key: key.to_owned(),
+                found,
+                expected: sha256.to_owned(),
+            })
+        }
+    }
+
+    /// Streams a part of an object.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn stream(
+        &self,
+        key: &str,
+        range: Range<u64>,
+    ) -> Result<BoxStream<'static, Result<Bytes, object_store::Error>>, BlobError> {
+        if range.is_empty() {
+            return Ok(futures::stream::empty().boxed());
+        }
+        let options = GetOptions {
+            range: Some(GetRange::Bounded(range)),
+            ..GetOptions::default()
+        };
+        Ok(self.store.get_opts(&Key::from(key), options).await?.into_stream())
+    }
+
+    /// Deletes an object; one that is not there is deleted already.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn delete(&self, key: &str) -> Result<(), BlobError> {
+        match self.store.delete(&Key::from(key)).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Deletes every object below a key; returns how many there were.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn delete_below(&self, key: &str) -> Result<u64, BlobError> {
+        let prefix = Key::from(key);
+        let locations = self
+            .store
+            .list(Some(&prefix))
+            .map_ok(|object| object.location)
+            .boxed();
+        let deleted = self
+            .store
+            .delete_stream(locations)
+            .try_fold(0, |count, _| async move { Ok(count + 1) })
+            .await?;
+        // Object stores have no directories; a directory's empty ones would stay for ever.
+        if let Some(path) = self.local_path(key) {
+            let _ = std::fs::remove_dir(path);
+        }
+        Ok(deleted)
+    }
+
+    /// Keys of the objects below a key.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn list(&self, key: &str) -> Result<Vec<String>, BlobError> {
+        let prefix = Key::from(key);
+        let mut keys: Vec<String> = self
+            .store
+            .list(Some(&prefix))
+            .map_ok(|object| object.location.to_string())
+            .try_collect()
+            .await?;
+        keys.sort();
+        Ok(keys)
+    }
+}

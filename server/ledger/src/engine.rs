@@ -1,0 +1,297 @@
+//! The two database engines behind one small surface: values in, rows out, transactions.
+//!
+//! Statements are written once, in the SQL that SQLite and PostgreSQL share (`$1` parameters,
+//! `RETURNING`, `ON CONFLICT`); [`Engine`] tells the few places where they differ.
+
+use crate::LedgerError;
+use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
+use sqlx::sqlite::{
+    SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
+};
+use sqlx::{Postgres, Row as _, Sqlite};
+use std::str::FromStr;
+use std::time::Duration;
+
+/// Which database.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Engine {
+    /// Embedded: one file, one machine.
+    Sqlite,
+    /// The engine that several machines share.
+    Postgres,
+}
+
+/// A parameter. NULL is typed, because PostgreSQL wants to know.
+#[derive(Debug, Clone)]
+pub(crate) enum Value {
+    Int(Option<i64>),
+    Real(f64),
+    Text(Option<String>),
+}
+
+impl From<i64> for Value {
+    fn from(value: i64) -> Self {
+        Self::Int(Some(value))
+    }
+}
+impl From<u64> for Value {
+    /// Counts of runs, epochs and bytes: the contract keeps them far below 2^63.
+    fn from(value: u64) -> Self {
+        Self::Int(Some(i64::try_from(value).unwrap_or(i64::MAX)))
+    }
+}
+impl From<f64> for Value {
+    fn from(value: f64) -> Self {
+        Self::Real(value)
+    }
+}
+impl From<&str> for Value {
+    fn from(value: &str) -> Self {
+        Self::Text(Some(value.to_owned()))
+    }
+}
+impl From<String> for Value {
+    fn from(value: String) -> Self {
+        Self::Text(Some(value))
+    }
+}
+impl From<Option<String>> for Value {
+    fn from(value: Option<String>) -> Self {
+        Self::Text(value)
+    }
+}
+
+/// Parameters of one statement.
+macro_rules! values {
+    ($($value:expr),* $(,)?) => { &[$($crate::engine::Value::from($value)),*] };
+}
+pub(crate) use values;
+
+/// A row of either engine, read by column name.
+pub(crate) enum Row {
+    Sqlite(SqliteRow),
+    Postgres(PgRow),
+}
+
+impl Row {
+    pub(crate) fn int(&self, column: &str) -> Result<i64, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(column)?,
+            Self::Postgres(row) => row.try_get(column)?,
+        })
+    }
+
+    pub(crate) fn count(&self, column: &str) -> Result<u64, LedgerError> {
+        let value = self.int(column)?;
+        u64::try_from(value).map_err(|_| LedgerError::corrupt(column, &value.to_string()))
+    }
+
+    pub(crate) fn real(&self, column: &str) -> Result<f64, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(column)?,
+            Self::Postgres(row) => row.try_get(column)?,
+        })
+    }
+
+    pub(crate) fn optional_int(&self, column: &str) -> Result<Option<i64>, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(column)?,
+            Self::Postgres(row) => row.try_get(column)?,
+        })
+    }
+
+    pub(crate) fn optional_text(&self, column: &str) -> Result<Option<String>, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(row) => row.try_get(column)?,
+            Self::Postgres(row) => row.try_get(column)?,
+        })
+    }
+
+    pub(crate) fn text(&self, column: &str) -> Result<String, LedgerError> {
+        self.optional_text(column)?
+            .ok_or_else(|| LedgerError::corrupt(column, "NULL"))
+    }
+
+    /// A text column in its own type.
+    pub(crate) fn parse<T: FromStr>(&self, column: &str) -> Result<T, LedgerError> {
+        let text = self.text(column)?;
+        text.parse().map_err(|_| LedgerError::corrupt(column, &text))
+    }
+
+    /// A nullable text column in its own type.
+    pub(crate) fn parse_optional<T: FromStr>(&self, column: &str) -> Result<Option<T>, LedgerError> {
+        self.optional_text(column)?
+            .map(|text| text.parse().map_err(|_| LedgerError::corrupt(column, &text)))
+            .transpose()
+    }
+
+    /// A JSON column in its own type.
+    pub(crate) fn json<T: serde::de::DeserializeOwned>(&self, column: &str) -> Result<T, LedgerError> {
+        let text = self.text(column)?;
+        serde_json::from_str(&text).map_err(|_| LedgerError::corrupt(column, &text))
+    }
+}
+
+/// Connections to one database.
+#[derive(Clone)]
+pub(crate) enum Pool {
+    Sqlite(SqlitePool),
+    Postgres(PgPool),
+}
+
+/// A transaction; rolled back when dropped.
+pub(crate) enum Transaction {
+    Sqlite(sqlx::Transaction<'static, Sqlite>),
+    Postgres(sqlx::Transaction<'static, Postgres>),
+}
+
+/// How long a writer waits for another one before it gives up. Transactions here take milliseconds,
+/// but a full disk queue or a stopped process can hold one much longer.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+
+macro_rules! bind_all {
+    ($statement:expr, $parameters:expr) => {{
+        let mut statement = sqlx::query($statement);
+        for parameter in $parameters {
+            statement = match parameter.clone() {
+                Value::Int(value) => statement.bind(value),
+                Value::Real(value) => statement.bind(value),
+                Value::Text(value) => statement.bind(value),
+            };
+        }
+        statement
+    }};
+}
+
+impl Pool {
+    /// Connects; `sqlite:PATH` and `sqlite://PATH` make the file if it is absent.
+    pub(crate) async fn connect(url: &str, connections: u32) -> Result<Self, LedgerError> {
+        if url.starts_with("sqlite:") {
+            let options = SqliteConnectOptions::from_str(url)?
+                .create_if_missing(true)
+                .journal_mode(SqliteJournalMode::Wal)
+                .synchronous(SqliteSynchronous::Full)
+                .busy_timeout(BUSY_TIMEOUT)
+                .foreign_keys(true);
+            let pool = SqlitePoolOptions::new()
+                .max_connections(connections)
+                .acquire_timeout(BUSY_TIMEOUT)
+                .connect_with(options)
+                .await?;
+            Ok(Self::Sqlite(pool))
+        } else if url.starts_with("postgres:") || url.starts_with("postgresql:") {
+            let pool = PgPoolOptions::new()
+                .max_connections(connections)
+                .acquire_timeout(BUSY_TIMEOUT)
+                .connect(url)
+                .await?;
+            Ok(Self::Postgres(pool))
+        } else {
+            // The URL may hold a password: only its scheme is repeated.
+            let scheme = url.split(':').next().unwrap_or_default().to_owned();
+            Err(LedgerError::UnknownEngine { scheme })
+        }
+    }
+
+    pub(crate) fn engine(&self) -> Engine {
+        match self {
+            Self::Sqlite(_) => Engine::Sqlite,
+            Self::Postgres(_) => Engine::Postgres,
+        }
+    }
+
+    pub(crate) async fn rows(&self, sql: &'static str, with: &[Value]) -> Result<Vec<Row>, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(pool) => bind_all!(sql, with)
+                .fetch_all(pool)
+                .await?
+                .into_iter()
+                .map(Row::Sqlite)
+                .collect(),
+            Self::Postgres(pool) => bind_all!(sql, with)
+                .fetch_all(pool)
+                .await?
+                .into_iter()
+                .map(Row::Postgres)
+                .collect(),
+        })
+    }
+
+    pub(crate) async fn row(&self, sql: &'static str, with: &[Value]) -> Result<Option<Row>, LedgerError> {
+        Ok(self.rows(sql, with).await?.into_iter().next())
+    }
+
+    pub(crate) async fn execute(&self, sql: &'static str, with: &[Value]) -> Result<u64, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(pool) => bind_all!(sql, with).execute(pool).await?.rows_affected(),
+            Self::Postgres(pool) => bind_all!(sql, with).execute(pool).await?.rows_affected(),
+        })
+    }
+
+    /// Begins a transaction that will write. SQLite takes its write lock at once, so that a
+    /// transaction never has to be repeated because another one wrote after it had read.
+    pub(crate) async fn begin(&self) -> Result<Transaction, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(pool) => Transaction::Sqlite(pool.begin_with("BEGIN IMMEDIATE").await?),
+            Self::Postgres(pool) => Transaction::Postgres(pool.begin().await?),
+        })
+    }
+
+    /// Runs a script of several statements.
+    pub(crate) async fn script(transaction: &mut Transaction, sql: &'static str) -> Result<(), LedgerError> {
+        match transaction {
+            Transaction::Sqlite(tx) => sqlx::raw_sql(sql).execute(&mut **tx).await.map(drop)?,
+            Transaction::Postgres(tx) => sqlx::raw_sql(sql).execute(&mut **tx).await.map(drop)?,
+        }
+        Ok(())
+    }
+
+    pub(crate) async fn close(&self) {
+        match self {
+            Self::Sqlite(pool) => pool.close().await,
+            Self::Postgres(pool) => pool.close().await,
+        }
+    }
+}
+
+impl Transaction {
+    pub(crate) async fn rows(&mut self, sql: &'static str, with: &[Value]) -> Result<Vec<Row>, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(tx) => bind_all!(sql, with)
+                .fetch_all(&mut **tx)
+                .await?
+                .into_iter()
+                .map(Row::Sqlite)
+                .collect(),
+            Self::Postgres(tx) => bind_all!(sql, with)
+                .fetch_all(&mut **tx)
+                .await?
+                .into_iter()
+                .map(Row::Postgres)
+                .collect(),
+        })
+    }
+
+    pub(crate) async fn row(
+        &mut self,
+        sql: &'static str,
+        with: &[Value],
+    ) -> Result<Option<Row>, LedgerError> {
+        Ok(self.rows(sql, with).await?.into_iter().next())
+    }
+
+    pub(crate) async fn execute(&mut self, sql: &'static str, with: &[Value]) -> Result<u64, LedgerError> {
+        Ok(match self {
+            Self::Sqlite(tx) => bind_all!(sql, with).execute(&mut **tx).await?.rows_affected(),
+            Self::Postgres(tx) => bind_all!(sql, with).execute(&mut **tx).await?.rows_affected(),
+        })
+    }
+
+    pub(crate) async fn commit(self) -> Result<(), LedgerError> {
+        match self {
+            Self::Sqlite(tx) => tx.commit().await?,
+            Self::Postgres(tx) => tx.commit().await?,
+        }
+        Ok(())
+    }
+}

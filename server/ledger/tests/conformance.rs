@@ -1,0 +1,512 @@
+//! One suite for every engine: what the ledger promises, whatever stands below it.
+
+use hydroflex_ledger::transition::{ATTEMPT_LIMIT, ShardState};
+use hydroflex_ledger::{
+    CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, NewJob, NewModel, ShardKind,
+    ShardResult,
+};
+use hydroflex_openapi::catalogue::FileEntry;
+use hydroflex_openapi::event::EventKind;
+use hydroflex_openapi::id::{DatasetId, JobId, ModelId};
+use hydroflex_openapi::job::{JobSpec, TrainingSpec};
+use hydroflex_openapi::status::{JobState, TimeSplit, TrainingProgress, TrainingState};
+
+const HASH: &str = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08";
+
+fn spec(runs: u64, settling_runs: u64) -> JobSpec {
+    serde_json::from_value(serde_json::json!({ "runs": runs, "settling_runs": settling_runs })).unwrap()
+}
+
+fn new_job(run_shards: &[u64]) -> NewJob {
+    NewJob {
+        spec: spec(run_shards.iter().sum(), 0),
+        machine_sha256: HASH.to_owned(),
+        settling_shards: Vec::new(),
+        run_shards: run_shards.to_vec(),
+    }
+}
+
+fn result(object: &str) -> ShardResult {
+    ShardResult {
+        object: object.to_owned(),
+        sha256: HASH.to_owned(),
+        size_bytes: 10,
+        failed_runs: 1,
+        spent: TimeSplit {
+            simulate_s: 0.5,
+            encode_s: 0.25,
+            put_s: 0.125,
+        },
+    }
+}
+
+fn new_dataset() -> NewDataset {
+    NewDataset {
+        id: DatasetId::of_sha256(HASH).unwrap(),
+        sha256: HASH.to_owned(),
+        spec: spec(4, 0),
+        runs: 4,
+        files: vec![FileEntry {
+            path: "README.md".to_owned(),
+            size_bytes: 3,
+            sha256: HASH.to_owned(),
+        }],
+    }
+}
+
+async fn sqlite(folder: &tempfile::TempDir) -> Ledger {
+    let url = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
+    let ledger = Ledger::create(&url).await.unwrap();
+    for worker in ["a", "b"] {
+        ledger.register_worker(worker).await.unwrap();
+    }
+    ledger
+}
+
+/// Every test of the suite on every engine.
+macro_rules! on_every_engine {
+    ($($name:ident),* $(,)?) => {
+        mod on_sqlite {
+            $(
+                #[tokio::test(flavor = "multi_thread")]
+                async fn $name() {
+                    let folder = tempfile::tempdir().unwrap();
+                    super::$name(super::sqlite(&folder).await).await;
+                }
+            )*
+        }
+    };
+}
+
+on_every_engine![
+    a_job_its_shards_and_its_event_appear_together,
+    the_same_key_makes_one_job,
+    shards_are_handed_out_once_in_order,
+    a_commit_of_an_old_epoch_is_fenced,
+    a_repeated_commit_is_the_same_commit,
+    a_released_shard_loses_no_attempt,
+    a_bad_run_is_isolated,
+    a_cancelled_job_takes_nothing_more,
+    a_worker_that_is_given_up_holds_nothing,
+    of_two_planners_one_wins,
+    a_data_set_appears_once_with_its_trainings,
+    a_failed_training_fails_its_job_and_keeps_the_data_set,
+    many_workers_share_without_overlap,
+    pages_of_jobs_are_newest_first,
+];
+
+async fn a_job_its_shards_and_its_event_appear_together(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[3, 2]), None).await.unwrap().id();
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(job.state, JobState::Queued);
+    assert_eq!((job.progress.runs_total, job.runs_planned), (5, 5));
+    assert_eq!(ledger.open_shard_count(id).await.unwrap(), 2);
+    let events = ledger.events(id, 0, 10).await.unwrap();
+    assert_eq!(events.len(), 1);
+    assert_eq!(events[0].sequence, 1);
+    assert_eq!(
+        events[0].what,
+        EventKind::State {
+            state: JobState::Queued,
+            reason: None
+        }
+    );
+    assert!(ledger.job(JobId::generate()).await.unwrap().is_none());
+}
+
+async fn the_same_key_makes_one_job(ledger: Ledger) {
+    let key = IdempotencyKey::new("monday", b"{\"runs\": 4}");
+    let first = ledger.create_job(&new_job(&[4]), Some(&key)).await.unwrap();
+    let second = ledger.create_job(&new_job(&[4]), Some(&key)).await.unwrap();
+    assert!(matches!(first, Created::New(_)));
+    assert_eq!(second, Created::Before(first.id()));
+    assert_eq!(ledger.jobs(None, 10).await.unwrap().len(), 1);
+    let other = IdempotencyKey::new("monday", b"{\"runs\": 5}");
+    let refused = ledger.create_job(&new_job(&[5]), Some(&other)).await;
+    assert!(
+        matches!(refused, Err(LedgerError::KeyReused { .. })),
+        "{refused:?}"
+    );
+    assert_eq!(ledger.jobs(None, 10).await.unwrap().len(), 1);
+}
+
+async fn shards_are_handed_out_once_in_order(ledger: Ledger) {
+    let mut new = new_job(&[3, 2]);
+    new.spec.settling_runs = 1;
+    new.settling_shards = vec![1];
+    let id = ledger.create_job(&new, None).await.unwrap().id();
+    let settling = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert_eq!(settling.shard.kind, ShardKind::Settling);
+    assert_eq!(settling.job.state, JobState::Simulating);
+    let first = ledger.begin_shard("b").await.unwrap().unwrap();
+    let second = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert_eq!((first.shard.first_run, first.shard.run_count), (0, 3));
+    assert_eq!((second.shard.first_run, second.shard.run_count), (3, 2));
+    assert!(ledger.begin_shard("b").await.unwrap().is_none());
+    for claim in [&settling, &first, &second] {
+        let outcome = ledger
+            .commit_shard(claim, &result(&claim.object()))
+            .await
+            .unwrap();
+        assert_eq!(outcome, CommitOutcome::Committed);
+    }
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert!(job.is_complete());
+    assert_eq!(job.progress.runs_done, 5);
+    assert_eq!(job.progress.runs_failed, 2);
+    assert!((job.progress.spent.simulate_s - 1.5).abs() < 1e-12);
+    assert!((ledger.run_cost_s(id).await.unwrap().unwrap() - 1.0 / 5.0).abs() < 1e-12);
+    let settled = ledger.settled_shards(id, ShardKind::Runs, 0, 10).await.unwrap();
+    assert_eq!(
+        settled.iter().map(|shard| shard.first_run).collect::<Vec<_>>(),
+        [0, 3]
+    );
+}
+
+async fn a_commit_of_an_old_epoch_is_fenced(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    let slow = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert!(
+        ledger
+            .lose_shard(slow.shard.id, slow.shard.epoch, "stopped")
+            .await
+            .unwrap()
+    );
+    assert!(!ledger.holds(&slow).await.unwrap());
+    let quick = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert_eq!(
+        (quick.shard.id, quick.shard.epoch),
+        (slow.shard.id, slow.shard.epoch + 1)
+    );
+    assert_ne!(quick.object(), slow.object());
+    let late = ledger.commit_shard(&slow, &result(&slow.object())).await.unwrap();
+    assert_eq!(late, CommitOutcome::Fenced);
+    let outcome = ledger
+        .commit_shard(&quick, &result(&quick.object()))
+        .await
+        .unwrap();
+    assert_eq!(outcome, CommitOutcome::Committed);
+    // Losing an attempt that is over changes nothing.
+    assert!(
+        !ledger
+            .lose_shard(quick.shard.id, quick.shard.epoch, "late news")
+            .await
+            .unwrap()
+    );
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().progress.runs_done, 4);
+}
+
+async fn a_repeated_commit_is_the_same_commit(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+    for _ in 0..2 {
+        let outcome = ledger
+            .commit_shard(&claim, &result(&claim.object()))
+            .await
+            .unwrap();
+        assert_eq!(outcome, CommitOutcome::Committed);
+    }
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().progress.runs_done, 4);
+}
+
+async fn a_released_shard_loses_no_attempt(ledger: Ledger) {
+    ledger.create_job(&new_job(&[4]), None).await.unwrap();
+    for _ in 0..2 * ATTEMPT_LIMIT {
+        let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+        assert_eq!(claim.shard.attempt, 1);
+        assert!(ledger.release_shard(&claim).await.unwrap());
+        assert!(!ledger.release_shard(&claim).await.unwrap());
+    }
+}
+
+async fn a_bad_run_is_isolated(ledger: Ledger) {
+    const BAD: u64 = 5;
+    let id = ledger.create_job(&new_job(&[8, 8]), None).await.unwrap().id();
+    while let Some(claim) = ledger.begin_shard("a").await.unwrap() {
+        let runs = claim.shard.first_run..claim.shard.first_run + claim.shard.run_count;
+        if runs.contains(&BAD) {
+            ledger
+                .lose_shard(claim.shard.id, claim.shard.epoch, "boom")
+                .await
+                .unwrap();
+        } else {
+            ledger
+                .commit_shard(&claim, &result(&claim.object()))
+                .await
+                .unwrap();
+        }
+    }
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert!(job.is_complete());
+    let settled = ledger.settled_shards(id, ShardKind::Runs, 0, 100).await.unwrap();
+    let mut next = 0;
+    for shard in &settled {
+        assert_eq!(shard.first_run, next, "runs are covered once, without gaps");
+        next += shard.run_count;
+        let expected = if shard.first_run == BAD {
+            ShardState::Dead
+        } else {
+            ShardState::Committed
+        };
+        assert_eq!(shard.state, expected);
+    }
+    assert_eq!(next, 16);
+    let dead = settled
+        .iter()
+        .find(|shard| shard.state == ShardState::Dead)
+        .unwrap();
+    assert_eq!((dead.run_count, dead.reason.as_deref()), (1, Some("boom")));
+}
+
+async fn a_cancelled_job_takes_nothing_more(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4, 4]), None).await.unwrap().id();
+    let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert!(ledger.cancel_job(id).await.unwrap());
+    assert!(!ledger.cancel_job(id).await.unwrap());
+    assert!(!ledger.holds(&claim).await.unwrap());
+    let late = ledger
+        .commit_shard(&claim, &result(&claim.object()))
+        .await
+        .unwrap();
+    assert_eq!(late, CommitOutcome::Fenced);
+    assert!(ledger.begin_shard("a").await.unwrap().is_none());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!((job.state, job.progress.runs_done), (JobState::Cancelled, 0));
+    assert!(ledger.unfinished_jobs().await.unwrap().is_empty());
+    assert_eq!(ledger.uncollected_jobs(10).await.unwrap(), [id]);
+    ledger.mark_collected(id).await.unwrap();
+    assert!(ledger.uncollected_jobs(10).await.unwrap().is_empty());
+    let missing = ledger.cancel_job(JobId::generate()).await;
+    assert!(matches!(missing, Err(LedgerError::NoJob { .. })), "{missing:?}");
+}
+
+async fn a_worker_that_is_given_up_holds_nothing(ledger: Ledger) {
+    ledger.create_job(&new_job(&[4, 4]), None).await.unwrap();
+    let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert!(ledger.beat("a").await.unwrap());
+    let beats = ledger.beats().await.unwrap();
+    assert_eq!(
+        beats
+            .iter()
+            .map(|beat| (&*beat.worker, beat.beat))
+            .collect::<Vec<_>>(),
+        [("a", 1), ("b", 0)]
+    );
+    ledger.give_up_worker("a", "gone").await.unwrap();
+    assert!(!ledger.beat("a").await.unwrap());
+    assert!(ledger.begin_shard("a").await.unwrap().is_none());
+    let again = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert_eq!((again.shard.id, again.shard.attempt), (claim.shard.id, 2));
+    assert_eq!(again.shard.reason.as_deref(), Some("gone"));
+    assert_eq!(ledger.recover_lost("gone").await.unwrap(), 0);
+}
+
+async fn of_two_planners_one_wins(ledger: Ledger) {
+    let mut new = new_job(&[2]);
+    new.spec.runs = 8;
+    let id = ledger.create_job(&new, None).await.unwrap().id();
+    assert!(ledger.plan_shards(id, ShardKind::Runs, 2, &[3, 3]).await.unwrap());
+    assert!(!ledger.plan_shards(id, ShardKind::Runs, 2, &[6]).await.unwrap());
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().runs_planned, 8);
+    assert_eq!(ledger.open_shard_count(id).await.unwrap(), 3);
+}
+
+async fn finish_runs(ledger: &Ledger, id: JobId) {
+    while let Some(claim) = ledger.begin_shard("a").await.unwrap() {
+        ledger
+            .commit_shard(&claim, &result(&claim.object()))
+            .await
+            .unwrap();
+    }
+    assert!(ledger.begin_publishing(id).await.unwrap());
+    assert!(!ledger.begin_publishing(id).await.unwrap());
+}
+
+async fn a_data_set_appears_once_with_its_trainings(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[2, 2]), None).await.unwrap().id();
+    assert!(!ledger.begin_publishing(id).await.unwrap(), "runs are missing");
+    finish_runs(&ledger, id).await;
+    let dataset = new_dataset();
+    assert!(
+        ledger
+            .publish_dataset(id, &dataset, &[TrainingSpec::default()])
+            .await
+            .unwrap()
+    );
+    assert!(
+        !ledger
+            .publish_dataset(id, &dataset, &[TrainingSpec::default()])
+            .await
+            .unwrap()
+    );
+    assert_eq!(ledger.trainings_of(id).await.unwrap().len(), 1);
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().state, JobState::Training);
+
+    let claim = ledger.begin_training("a").await.unwrap().unwrap();
+    assert!(ledger.begin_training("b").await.unwrap().is_none());
+    assert!(
+        ledger
+            .report_training(&claim, &TrainingProgress::default())
+            .await
+            .unwrap()
+    );
+    ledger.give_up_worker("a", "killed").await.unwrap();
+    assert!(
+        !ledger
+            .report_training(&claim, &TrainingProgress::default())
+            .await
+            .unwrap()
+    );
+    let claim = ledger.begin_training("b").await.unwrap().unwrap();
+    let model = NewModel {
+        id: ModelId::of_sha256(HASH).unwrap(),
+        sha256: HASH.to_owned(),
+        metrics: serde_json::json!({ "mae": 1.0 }),
+        files: Vec::new(),
+    };
+    assert!(ledger.commit_training(&claim, &model).await.unwrap());
+    assert!(!ledger.commit_training(&claim, &model).await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(
+        (job.state, job.dataset_id),
+        (JobState::Succeeded, Some(dataset.id.clone()))
+    );
+    assert_eq!(
+        ledger.model(&model.id).await.unwrap().unwrap().metrics,
+        model.metrics
+    );
+    assert_eq!(ledger.models(None, 10).await.unwrap().len(), 1);
+
+    // Another job that leads to the same content finds the data set there already.
+    let twin = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    ledger.register_worker("c").await.unwrap();
+    let claim = ledger.begin_shard("c").await.unwrap().unwrap();
+    ledger
+        .commit_shard(&claim, &result(&claim.object()))
+        .await
+        .unwrap();
+    assert!(ledger.begin_publishing(twin).await.unwrap());
+    assert!(ledger.publish_dataset(twin, &dataset, &[]).await.unwrap());
+    assert_eq!(
+        ledger.job(twin).await.unwrap().unwrap().state,
+        JobState::Succeeded
+    );
+    let datasets = ledger.datasets(None, 10).await.unwrap();
+    assert_eq!(datasets.len(), 1);
+    assert_eq!(datasets[0].job_id, id);
+    let after_it = ledger
+        .datasets(Some((datasets[0].created_ms, dataset.id.as_str())), 10)
+        .await
+        .unwrap();
+    assert!(after_it.is_empty());
+    // Sequence numbers have no gaps.
+    let sequences: Vec<u64> = ledger
+        .events(id, 0, 100)
+        .await
+        .unwrap()
+        .iter()
+        .map(|event| event.sequence)
+        .collect();
+    assert_eq!(sequences, (1..=sequences.len() as u64).collect::<Vec<_>>());
+}
+
+async fn a_failed_training_fails_its_job_and_keeps_the_data_set(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    finish_runs(&ledger, id).await;
+    let specs = [TrainingSpec::default(), TrainingSpec::default()];
+    ledger.publish_dataset(id, &new_dataset(), &specs).await.unwrap();
+    let bad = ledger.begin_training("a").await.unwrap().unwrap();
+    assert!(
+        ledger
+            .fail_training(&bad, "the data set lacks target x")
+            .await
+            .unwrap()
+    );
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().state, JobState::Training);
+    for attempt in 1..=ATTEMPT_LIMIT {
+        let claim = ledger.begin_training("a").await.unwrap().unwrap();
+        assert_eq!(claim.training.attempt, attempt);
+        ledger
+            .lose_training(claim.training.id, claim.training.epoch, "killed")
+            .await
+            .unwrap();
+    }
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(job.state, JobState::Failed);
+    assert_eq!(
+        job.reason.as_deref(),
+        Some("2 of 2 trainings failed; the data set is published")
+    );
+    assert!(job.dataset_id.is_some());
+    let first = ledger.training(bad.training.id).await.unwrap().unwrap();
+    assert_eq!(
+        (first.state, first.reason.as_deref()),
+        (TrainingState::Failed, Some("the data set lacks target x"))
+    );
+    let key = IdempotencyKey::new("again", b"x");
+    let direct = ledger
+        .create_training(&new_dataset().id, &TrainingSpec::default(), Some(&key))
+        .await
+        .unwrap();
+    let repeated = ledger
+        .create_training(&new_dataset().id, &TrainingSpec::default(), Some(&key))
+        .await
+        .unwrap();
+    assert_eq!(repeated, Created::Before(direct.id()));
+}
+
+async fn many_workers_share_without_overlap(ledger: Ledger) {
+    const WORKERS: usize = 6;
+    let id = ledger.create_job(&new_job(&[1; 60]), None).await.unwrap().id();
+    let mut tasks = Vec::new();
+    for number in 0..WORKERS {
+        let ledger = ledger.clone();
+        tasks.push(tokio::spawn(async move {
+            let name = format!("worker-{number}");
+            ledger.register_worker(&name).await.unwrap();
+            let mut runs = Vec::new();
+            while let Some(claim) = ledger.begin_shard(&name).await.unwrap() {
+                runs.push(claim.shard.first_run);
+                ledger
+                    .commit_shard(&claim, &result(&claim.object()))
+                    .await
+                    .unwrap();
+            }
+            runs
+        }));
+    }
+    let mut runs = Vec::new();
+    for task in tasks {
+        runs.extend(task.await.unwrap());
+    }
+    runs.sort_unstable();
+    assert_eq!(runs, (0..60).collect::<Vec<u64>>());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert!(job.is_complete());
+    // Queued, simulating, and one event per commit.
+    assert_eq!(job.last_sequence, 62);
+}
+
+async fn pages_of_jobs_are_newest_first(ledger: Ledger) {
+    let mut ids = Vec::new();
+    for _ in 0..5 {
+        ids.push(ledger.create_job(&new_job(&[1]), None).await.unwrap().id());
+    }
+    ids.reverse();
+    let first: Vec<JobId> = ledger
+        .jobs(None, 3)
+        .await
+        .unwrap()
+        .iter()
+        .map(|job| job.id)
+        .collect();
+    assert_eq!(first, ids[..3]);
+    let rest: Vec<JobId> = ledger
+        .jobs(Some(first[2]), 3)
+        .await
+        .unwrap()
+        .iter()
+        .map(|job| job.id)
+        .collect();
+    assert_eq!(rest, ids[3..]);
+}
