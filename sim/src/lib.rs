@@ -1,4 +1,12 @@
 //! The hydroflex engine: a machine in, a trajectory out. No network, no clock, no hidden seed.
 
 pub mod reduction;
+pub mod body;
+pub mod joint;
+pub mod hydraulics;
+pub mod force;
+pub mod system;
+pub mod integrate;
+pub mod equilibrium;
 pub mod trajectory;
+pub mod simulator;

@@ -2,6 +2,14 @@
 
 use hydroflex_openapi::job::{Integrator, RunFlag};
 
+mod channels;
+mod failure;
+pub(crate) mod recorder;
+
+pub use channels::channels;
+pub use failure::{InputError, RunFailure};
+pub use recorder::von_mises_pa;
+
 /// One run as asked for: the configuration, and the valve signal of every cylinder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunInput {
@@ -49,4 +57,27 @@ pub struct SolverStatistics {
     pub iterations: u64,
     /// Jacobian evaluations with factorisation.
     pub factorisations: u64,
+    /// Which equations were integrated.
+    pub path: SolverPath,
+}
+
+/// Which equations were integrated. Chosen by the simulator, reported with every run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SolverPath {
+    /// Redundant coordinates with multipliers: any machine.
+    #[default]
+    General,
+    /// Minimal coordinates of one boom that moves in its plane.
+    Planar,
+}
+
+impl SolverPath {
+    /// Name in data sets.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::General => "general",
+            Self::Planar => "planar",
+        }
+    }
 }

@@ -1,0 +1,266 @@
+//! The façade: a machine in, trajectories out.
+
+use std::sync::{Arc, OnceLock};
+
+use hydroflex_openapi::channel::Channel;
+use hydroflex_openapi::job::Integrator;
+use hydroflex_openapi::machine::MachineFile;
+
+use crate::equilibrium::{Equilibrium, equilibrium};
+use crate::integrate::{Scheme, Stepper};
+use crate::reduction::ReducedBody;
+use crate::system::System;
+use crate::trajectory::recorder::{FlagSet, Recorder};
+use crate::trajectory::{InputError, RunFailure, RunInput, RunSettings, Trajectory, channels};
+use hydroflex_openapi::job::RunFlag;
+
+/// Spectral radius of the generalised-α scheme that runs can ask for.
+const SPECTRAL_RADIUS: f64 = 0.7;
+
+/// A machine ready to run. Cheap to share; every method takes `&self`.
+#[derive(Debug)]
+pub struct Simulator {
+    file: MachineFile,
+    channels: Vec<Channel>,
+    reduced: [Vec<ReducedBody>; 2],
+    variants: [OnceLock<Result<Arc<Variant>, RunFailure>>; 2],
+}
+
+/// What is constant for runs with, or without, a payload.
+#[derive(Debug)]
+struct Variant {
+    system: System,
+    recorder: Recorder,
+}
+
+impl Simulator {
+    /// A simulator of reduced bodies without and with payload.
+    #[must_use]
+    pub fn from_parts(
+        file: MachineFile,
+        without_payload: Vec<ReducedBody>,
+        with_payload: Vec<ReducedBody>,
+    ) -> Self {
+        Self {
+            channels: channels(&file),
+            file,
+            reduced: [without_payload, with_payload],
+            variants: [OnceLock::new(), OnceLock::new()],
+        }
+    }
+
+    /// Channels in column order.
+    #[must_use]
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    fn variant(&self, payload_kg: f64) -> Result<Arc<Variant>, RunFailure> {
+        let index = usize::from(payload_kg > 0.0);
+        let made = self.variants[index].get_or_init(|| {
+            let reduced = &self.reduced[index];
+            let system = System::new(&self.file, reduced, payload_kg)?;
+            let recorder = Recorder::new(&self.file, reduced, &system);
+            Ok(Arc::new(Variant { system, recorder }))
+        });
+        made.clone()
+    }
+
+    /// Static equilibrium at the given angles.
+    ///
+    /// # Errors
+    /// If the machine cannot be assembled or held there.
+    pub fn equilibrium(&self, payload_kg: f64, angles_rad: &[f64]) -> Result<Equilibrium, RunFailure> {
+        let variant = self.variant(payload_kg)?;
+        let system = variant.system.with_payload_mass(payload_kg);
+        Ok(equilibrium(
+            &system,
+            &self.file,
+            angles_rad,
+            &mut system.new_workspace(),
+        )?)
+    }
+
+    /// Simulates one run.
+    ///
+    /// # Errors
+    /// Where a run fails: it is data, with its reason.
+    pub fn run(&self, input: &RunInput, settings: &RunSettings) -> Result<Trajectory, RunFailure> {
+        let samples = check(&self.file, input, settings)?;
+        let variant = self.variant(input.payload_kg)?;
+        let system = variant.system.with_payload_mass(input.payload_kg);
+        let (scheme, step_s) = match settings.integrator {
+            Integrator::TrapezoidalIndex2 { step_s } => (Scheme::TRAPEZOIDAL_INDEX_2, step_s),
+            Integrator::GeneralizedAlpha { step_s } => (Scheme::generalized_alpha(SPECTRAL_RADIUS), step_s),
+            Integrator::Accurate => (Scheme::generalized_alpha(SPECTRAL_RADIUS), 1e-4),
+        };
+        let steps_per_sample = steps_per_sample(settings.sample_time_s, step_s)?;
+        let start = equilibrium(
+            &system,
+            &self.file,
+            &input.angles_rad,
+            &mut system.new_workspace(),
+        )?;
+        let fixed = FixedStep {
+            samples,
+            sample_time_s: settings.sample_time_s,
+            steps_per_sample,
+        };
+        fixed.run(&system, &variant.recorder, scheme, start, input)
+    }
+}
+
+/// A run with a fixed number of steps per sample.
+#[derive(Debug, Clone, Copy)]
+struct FixedStep {
+    samples: usize,
+    sample_time_s: f64,
+    steps_per_sample: u32,
+}
+
+impl FixedStep {
+    fn run(
+        self,
+        system: &System,
+        recorder: &Recorder,
+        scheme: Scheme,
+        start: Equilibrium,
+        input: &RunInput,
+    ) -> Result<Trajectory, RunFailure> {
+        let cylinders = system.cylinders();
+        let step_s = self.sample_time_s / f64::from(self.steps_per_sample);
+        let signal = |cylinder: usize, sample: usize| {
+            if sample == 0 {
+                0.0
+            } else {
+                input.valves_ratio[cylinder][sample - 1]
+            }
+        };
+        let mut columns = recorder.new_columns(self.samples + 1);
+        let mut flags = FlagSet::default();
+        let (mut from, mut to) = (vec![0.0; cylinders.len()], vec![0.0; cylinders.len()]);
+        let mut stepper = Stepper::new(system, scheme, start.state)?;
+        recorder.record(
+            system,
+            &stepper.state,
+            &stepper.workspace,
+            |k| signal(k, 0),
+            &mut columns,
+        );
+        for sample in 1..=self.samples {
+            for step in 1..=self.steps_per_sample {
+                for (k, cylinder) in cylinders.iter().enumerate() {
+                    let (before, after) = (signal(k, sample - 1), signal(k, sample));
+                    let part = |i: u32| f64::from(i) / f64::from(self.steps_per_sample);
+                    from[k] = before + (after - before) * part(step - 1);
+                    // The last step ends exactly on the sample's value.
+                    to[k] = if step == self.steps_per_sample {
+                        after
+                    } else {
+                        before + (after - before) * part(step)
+                    };
+                    if cylinder.is_cut_off(stepper.workspace.cylinders[k].length_m) {
+                        (from[k], to[k]) = (0.0, 0.0);
+                        flags.set(RunFlag::StrokeCutoff);
+                    }
+                }
+                let t_s = self.sample_time_s * (sample - 1) as f64 + step_s * f64::from(step - 1);
+                stepper.advance(t_s, step_s, &from, &to)?;
+                for (k, cylinder) in cylinders.iter().enumerate() {
+                    let length_m = stepper.workspace.cylinders[k].length_m;
+                    flags.watch(cylinder, length_m, stepper.state.pressures_pa[k]);
+                }
+            }
+            recorder.record(
+                system,
+                &stepper.state,
+                &stepper.workspace,
+                |k| signal(k, sample),
+                &mut columns,
+            );
+        }
+        Ok(Trajectory {
+            sample_count: self.samples + 1,
+            columns,
+            flags: flags.list(),
+            statistics: stepper.statistics,
+        })
+    }
+}
+
+/// Checks a run against the machine; returns its number of samples after the first.
+fn check(file: &MachineFile, input: &RunInput, settings: &RunSettings) -> Result<usize, InputError> {
+    if input.valves_ratio.len() != file.cylinders.len() {
+        return Err(InputError::ValveCount {
+            given: input.valves_ratio.len(),
+            expected: file.cylinders.len(),
+        });
+    }
+    let samples = input.valves_ratio.first().map_or(0, Vec::len);
+    for valve in &input.valves_ratio {
+        if valve.len() != samples {
+            return Err(InputError::ValveLengths {
+                first: samples,
+                other: valve.len(),
+            });
+        }
+        if let Some(k) = valve.iter().position(|u| !(-1.0..=1.0).contains(u)) {
+            return Err(InputError::ValveRange {
+                value: valve[k],
+                sample: k + 1,
+            });
+        }
+    }
+    let positive = |name, value: f64| {
+        if value.is_finite() && value > 0.0 {
+            Ok(())
+        } else {
+            Err(InputError::Number {
+                name,
+                value,
+                allowed: "positive",
+            })
+        }
+    };
+    positive("sample time", settings.sample_time_s)?;
+    if let Integrator::TrapezoidalIndex2 { step_s } | Integrator::GeneralizedAlpha { step_s } =
+        settings.integrator
+    {
+        positive("step", step_s)?;
+    }
+    if !(input.payload_kg.is_finite() && input.payload_kg >= 0.0) {
+        return Err(InputError::Number {
+            name: "payload",
+            value: input.payload_kg,
+            allowed: "not negative",
+        });
+    }
+    if let Some(value) = input.angles_rad.iter().find(|a| !a.is_finite()) {
+        return Err(InputError::Number {
+            name: "angle",
+            value: *value,
+            allowed: "a number of radians",
+        });
+    }
+    Ok(samples)
+}
+
+/// Whole number of steps in a sample.
+fn steps_per_sample(sample_time_s: f64, step_s: f64) -> Result<u32, InputError> {
+    let ratio = sample_time_s / step_s;
+    let whole = ratio.round();
+    // Decimal fractions like 0.005/0.00005 are whole up to rounding.
+    if (1.0..=1e6).contains(&whole) && (ratio - whole).abs() < 1e-9 * whole {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "checked to be within 1 and 1e6"
+        )]
+        return Ok(whole as u32);
+    }
+    Err(InputError::Number {
+        name: "step",
+        value: step_s,
+        allowed: "a whole fraction of the sample time",
+    })
+}

@@ -1,0 +1,123 @@
+//! Dense LU factorisation with partial pivoting, in place and without allocation.
+
+/// Factors of a square matrix stored row by row.
+#[derive(Debug, Clone, Default)]
+pub struct DenseLu {
+    order: usize,
+    /// Matrix, later its factors.
+    pub values: Vec<f64>,
+    pivots: Vec<usize>,
+}
+
+impl DenseLu {
+    /// Room for a matrix of the given order, zero.
+    #[must_use]
+    pub fn new(order: usize) -> Self {
+        Self {
+            order,
+            values: vec![0.0; order * order],
+            pivots: vec![0; order],
+        }
+    }
+
+    /// Order of the matrix.
+    #[must_use]
+    pub fn order(&self) -> usize {
+        self.order
+    }
+
+    /// Factors `values`. Returns false where a pivot is zero or not finite.
+    #[must_use]
+    pub fn factorise(&mut self) -> bool {
+        let n = self.order;
+        for k in 0..n {
+            let mut pivot = k;
+            let mut largest = self.values[k * n + k].abs();
+            for i in k + 1..n {
+                let candidate = self.values[i * n + k].abs();
+                if candidate > largest {
+                    (pivot, largest) = (i, candidate);
+                }
+            }
+            if !(largest > 0.0 && largest.is_finite()) {
+                return false;
+            }
+            self.pivots[k] = pivot;
+            if pivot != k {
+                let (head, tail) = self.values.split_at_mut(pivot * n);
+                head[k * n..(k + 1) * n].swap_with_slice(&mut tail[..n]);
+            }
+            let (head, tail) = self.values.split_at_mut((k + 1) * n);
+            let top = &head[k * n + k..];
+            let inverse = 1.0 / top[0];
+            for row in tail.chunks_exact_mut(n) {
+                let row = &mut row[k..];
+                if row[0] == 0.0 {
+                    continue;
+                }
+                let factor = row[0] * inverse;
+                row[0] = factor;
+                for (r, t) in row[1..].iter_mut().zip(&top[1..]) {
+                    *r -= factor * t;
+                }
+            }
+        }
+        true
+    }
+
+    /// Solves in place with the factors.
+    pub fn solve(&self, right: &mut [f64]) {
+        let n = self.order;
+        debug_assert_eq!(right.len(), n);
+        for k in 0..n {
+            right.swap(k, self.pivots[k]);
+        }
+        for i in 0..n {
+            let row = &self.values[i * n..i * n + i];
+            let sum: f64 = row.iter().zip(right.iter()).map(|(a, b)| a * b).sum();
+            right[i] -= sum;
+        }
+        for i in (0..n).rev() {
+            let row = &self.values[i * n..(i + 1) * n];
+            let sum: f64 = row[i + 1..].iter().zip(&right[i + 1..]).map(|(a, b)| a * b).sum();
+            right[i] = (right[i] - sum) / row[i];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn solves_a_system_that_needs_row_exchanges() {
+        let n = 7;
+        let entry = |i: usize, j: usize| {
+            if i == j {
+                0.0
+            } else {
+                ((3 * i + 7 * j + 1) as f64 * 0.77).sin()
+            }
+        };
+        let mut lu = DenseLu::new(n);
+        for i in 0..n {
+            for j in 0..n {
+                lu.values[i * n + j] = entry(i, j);
+            }
+        }
+        let x: Vec<f64> = (0..n).map(|i| i as f64 - 2.5).collect();
+        let mut right: Vec<f64> = (0..n).map(|i| (0..n).map(|j| entry(i, j) * x[j]).sum()).collect();
+        assert!(lu.factorise());
+        lu.solve(&mut right);
+        for (a, b) in right.iter().zip(&x) {
+            assert!((a - b).abs() < 1e-12, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn says_when_a_matrix_is_singular() {
+        let mut lu = DenseLu::new(2);
+        lu.values.copy_from_slice(&[1.0, 2.0, 0.0, 0.0]);
+        assert!(!lu.factorise());
+    }
+}
