@@ -1,5 +1,6 @@
 //! The hydroflex engine: a machine in, a trajectory out. No network, no clock, no hidden seed.
 
+pub mod fe;
 pub mod reduction;
 pub mod body;
 pub mod joint;
