@@ -1,6 +1,7 @@
 //! The hydroflex engine: a machine in, a trajectory out. No network, no clock, no hidden seed.
 
 pub mod fe;
+pub mod machine;
 pub mod reduction;
 pub mod body;
 pub mod joint;

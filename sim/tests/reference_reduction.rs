@@ -8,6 +8,7 @@ use hydroflex_sim::fe::{
     InterfaceNodes, MassKind, Material, Mesh, Surface, area_weights, assemble_mass, assemble_stiffness,
     nodes_on_cylinder, read_abaqus, uniform_weights,
 };
+use hydroflex_sim::machine::Machine;
 use hydroflex_sim::reduction::{
     Damping, FlexibleModel, ReducedBody, clamped_hz, free_free_hz, mode_basis, reduce,
 };
@@ -292,4 +293,19 @@ fn static_modes_are_in_equilibrium_and_normal_modes_orthonormal() {
     let normal = modes.columns(12, 2).into_owned();
     let gram = normal.transpose() * m.multiply(&normal);
     assert!((gram - DMatrix::identity(2, 2)).amax() < 1e-12);
+}
+
+#[test]
+fn the_published_machine_file_gives_the_reference_bodies() {
+    let Some(r) = reference() else { return };
+    let folder = PathBuf::from(std::env::var_os("HYDROFLEX_REFERENCE").unwrap());
+    let mesh = folder.join("liftboom/Job-1.inp").display().to_string();
+    let machine = Machine::load("lift-boom-published", &[mesh]).unwrap();
+    for (with_payload, key) in [(false, "no_payload"), (true, "with_payload")] {
+        let bodies = machine.reduce(with_payload, None).unwrap();
+        let mut body = bodies[0].clone();
+        // sensors: tip deflection, tip strain, root stress
+        body.sensor_nodes.remove(0);
+        check_reduced(&r, &body, key);
+    }
 }
