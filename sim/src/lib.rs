@@ -12,3 +12,6 @@ pub mod integrate;
 pub mod equilibrium;
 pub mod trajectory;
 pub mod simulator;
+
+#[cfg(test)]
+pub(crate) mod testing;

@@ -3,3 +3,6 @@
 pub mod rotation;
 pub mod floating_frame;
 pub mod marker;
+
+#[cfg(test)]
+mod floating_frame_tests;
