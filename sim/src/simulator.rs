@@ -1,6 +1,7 @@
 //! The façade: a machine in, trajectories out.
 
-use std::sync::{Arc, OnceLock};
+use std::path::PathBuf;
+use std::sync::OnceLock;
 
 use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::job::Integrator;
@@ -8,8 +9,9 @@ use hydroflex_openapi::machine::MachineFile;
 
 use crate::equilibrium::{Equilibrium, equilibrium};
 use crate::integrate::{Scheme, Stepper};
-use crate::reduction::ReducedBody;
-use crate::system::System;
+use crate::machine::Machine;
+use crate::reduction::{ReducedBody, ReductionError};
+use crate::system::{System, SystemError};
 use crate::trajectory::recorder::{FlagSet, Recorder};
 use crate::trajectory::{InputError, RunFailure, RunInput, RunSettings, Trajectory, channels};
 use hydroflex_openapi::job::RunFlag;
@@ -17,36 +19,61 @@ use hydroflex_openapi::job::RunFlag;
 /// Spectral radius of the generalised-α scheme that runs can ask for.
 const SPECTRAL_RADIUS: f64 = 0.7;
 
-/// A machine ready to run. Cheap to share; every method takes `&self`.
+/// Why a machine cannot run at all.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SimulatorError {
+    /// A flexible body cannot be reduced.
+    #[error("{0}")]
+    Reduction(#[from] ReductionError),
+    /// The reduced machine cannot become a system of equations.
+    #[error(transparent)]
+    System(#[from] SystemError),
+}
+
+/// A machine ready to run. Share it behind an `Arc`: every method takes `&self`.
+///
+/// Bodies are reduced when first needed, once for runs without and once for runs with payload.
 #[derive(Debug)]
 pub struct Simulator {
-    file: MachineFile,
+    machine: Machine,
+    cache_dir: Option<PathBuf>,
     channels: Vec<Channel>,
-    reduced: [Vec<ReducedBody>; 2],
-    variants: [OnceLock<Result<Arc<Variant>, RunFailure>>; 2],
+    variants: [OnceLock<Result<Variant, SimulatorError>>; 2],
 }
 
 /// What is constant for runs with, or without, a payload.
 #[derive(Debug)]
 struct Variant {
+    reduced: Vec<ReducedBody>,
     system: System,
     recorder: Recorder,
 }
 
 impl Simulator {
-    /// A simulator of reduced bodies without and with payload.
+    /// A simulator of a machine.
+    ///
+    /// # Errors
+    /// None at present: what a machine's check cannot see is found by [`Simulator::prepare`].
+    pub fn new(machine: Machine) -> Result<Self, SimulatorError> {
+        Ok(Self::with_cache(machine, None))
+    }
+
+    /// A simulator that keeps reduced bodies in a folder.
     #[must_use]
-    pub fn from_parts(
-        file: MachineFile,
-        without_payload: Vec<ReducedBody>,
-        with_payload: Vec<ReducedBody>,
-    ) -> Self {
+    pub fn with_cache(machine: Machine, cache_dir: Option<PathBuf>) -> Self {
+        let channels = channels(machine.file());
         Self {
-            channels: channels(&file),
-            file,
-            reduced: [without_payload, with_payload],
+            machine,
+            cache_dir,
+            channels,
             variants: [OnceLock::new(), OnceLock::new()],
         }
+    }
+
+    /// The machine.
+    #[must_use]
+    pub fn machine(&self) -> &Machine {
+        &self.machine
     }
 
     /// Channels in column order.
@@ -55,15 +82,39 @@ impl Simulator {
         &self.channels
     }
 
-    fn variant(&self, payload_kg: f64) -> Result<Arc<Variant>, RunFailure> {
-        let index = usize::from(payload_kg > 0.0);
-        let made = self.variants[index].get_or_init(|| {
-            let reduced = &self.reduced[index];
-            let system = System::new(&self.file, reduced, payload_kg)?;
-            let recorder = Recorder::new(&self.file, reduced, &system);
-            Ok(Arc::new(Variant { system, recorder }))
+    /// Reduces the bodies now, so that a machine that cannot run is refused before any run starts.
+    ///
+    /// # Errors
+    /// If a body cannot be reduced, or the system has no equations.
+    pub fn prepare(&self, with_payload: bool) -> Result<(), SimulatorError> {
+        self.variant(with_payload).map(|_| ())
+    }
+
+    /// Reduced flexible bodies for runs without or with payload, in the machine's order.
+    ///
+    /// # Errors
+    /// As [`Simulator::prepare`].
+    pub fn reduced(&self, with_payload: bool) -> Result<&[ReducedBody], SimulatorError> {
+        Ok(&self.variant(with_payload)?.reduced)
+    }
+
+    fn variant(&self, with_payload: bool) -> Result<&Variant, SimulatorError> {
+        let made = self.variants[usize::from(with_payload)].get_or_init(|| {
+            let file = self.machine.file();
+            let reduced = self.machine.reduce(with_payload, self.cache_dir.as_deref())?;
+            // The mass is replaced run by run; here it only says that there is one.
+            let system = System::new(file, &reduced, if with_payload { 1.0 } else { 0.0 })?;
+            let recorder = Recorder::new(file, &reduced, &system);
+            Ok(Variant {
+                reduced,
+                system,
+                recorder,
+            })
         });
-        made.clone()
+        match made {
+            Ok(variant) => Ok(variant),
+            Err(error) => Err(error.clone()),
+        }
     }
 
     /// Static equilibrium at the given angles.
@@ -71,11 +122,11 @@ impl Simulator {
     /// # Errors
     /// If the machine cannot be assembled or held there.
     pub fn equilibrium(&self, payload_kg: f64, angles_rad: &[f64]) -> Result<Equilibrium, RunFailure> {
-        let variant = self.variant(payload_kg)?;
+        let variant = self.variant(payload_kg > 0.0)?;
         let system = variant.system.with_payload_mass(payload_kg);
         Ok(equilibrium(
             &system,
-            &self.file,
+            self.machine.file(),
             angles_rad,
             &mut system.new_workspace(),
         )?)
@@ -86,8 +137,8 @@ impl Simulator {
     /// # Errors
     /// Where a run fails: it is data, with its reason.
     pub fn run(&self, input: &RunInput, settings: &RunSettings) -> Result<Trajectory, RunFailure> {
-        let samples = check(&self.file, input, settings)?;
-        let variant = self.variant(input.payload_kg)?;
+        let samples = check(self.machine.file(), input, settings)?;
+        let variant = self.variant(input.payload_kg > 0.0)?;
         let system = variant.system.with_payload_mass(input.payload_kg);
         let (scheme, step_s) = match settings.integrator {
             Integrator::TrapezoidalIndex2 { step_s } => (Scheme::TRAPEZOIDAL_INDEX_2, step_s),
@@ -97,7 +148,7 @@ impl Simulator {
         let steps_per_sample = steps_per_sample(settings.sample_time_s, step_s)?;
         let start = equilibrium(
             &system,
-            &self.file,
+            self.machine.file(),
             &input.angles_rad,
             &mut system.new_workspace(),
         )?;

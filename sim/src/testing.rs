@@ -15,7 +15,10 @@ impl Numbers {
 
     pub(crate) fn next(&mut self) -> f64 {
         // A multiplicative congruential generator; the upper bits are good enough for test data.
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.0 = self
+            .0
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
     }
 
@@ -46,8 +49,12 @@ impl Cloud {
         let mut x = Numbers::new(seed);
         Self {
             masses_kg: (0..nodes).map(|_| 1.0 + 0.5 * x.next()).collect(),
-            points_m: (0..nodes).map(|_| x.vector() + Vector3::new(1.0, 0.0, 0.0)).collect(),
-            shapes: (0..nodes).map(|_| Matrix3xX::from_vec(x.list(3 * modes))).collect(),
+            points_m: (0..nodes)
+                .map(|_| x.vector() + Vector3::new(1.0, 0.0, 0.0))
+                .collect(),
+            shapes: (0..nodes)
+                .map(|_| Matrix3xX::from_vec(x.list(3 * modes)))
+                .collect(),
         }
     }
 

@@ -2,8 +2,8 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3xX, Vector3, Vector4};
 
-use super::rotation::{rate_map, rotation_matrix, skew};
 use super::floating_frame::{BodyMotion, FloatingFrame};
+use super::rotation::{rate_map, rotation_matrix, skew};
 use crate::testing::{Cloud, Numbers};
 
 const MODES: usize = 5;
@@ -39,7 +39,8 @@ impl Case {
     /// Residual without gravity: inertia, velocity and elastic terms.
     fn residual(&self, v: &[f64], a: &[f64]) -> DVector<f64> {
         let (mut rigid, mut modal) = ([0.0; 6], vec![0.0; MODES]);
-        self.frame.add_inertia_and_elastic(&self.motion(v, a), &mut rigid, &mut modal);
+        self.frame
+            .add_inertia_and_elastic(&self.motion(v, a), &mut rigid, &mut modal);
         DVector::from_iterator(6 + MODES, rigid.into_iter().chain(modal))
     }
 
@@ -60,14 +61,18 @@ impl Case {
         let p = self.cloud.points_m[i] + &psi * DVector::from_column_slice(&self.q[7..]);
         let mut jacobian = Matrix3xX::zeros(6 + MODES);
         jacobian.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-        jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&-(rotation * skew(&p)));
+        jacobian
+            .fixed_view_mut::<3, 3>(0, 3)
+            .copy_from(&-(rotation * skew(&p)));
         jacobian.columns_mut(6, MODES).copy_from(&(rotation * psi));
         (p, jacobian)
     }
 
     fn assemble(&self, of_node: impl Fn(usize) -> Vector3<f64>) -> DVector<f64> {
         let nodes = self.cloud.points_m.len();
-        (0..nodes).map(|i| self.node(i).1.transpose() * of_node(i) * self.cloud.masses_kg[i]).sum()
+        (0..nodes)
+            .map(|i| self.node(i).1.transpose() * of_node(i) * self.cloud.masses_kg[i])
+            .sum()
     }
 }
 
@@ -93,7 +98,11 @@ fn mass_matrix_equals_its_nodal_assembly() {
             })
             .sum();
         // The elastic forces of 1e3 N are subtracted: rounding of 1e-13 N against masses of 1..100.
-        assert!((&mass - &nodal).amax() < 1e-11 * nodal.amax(), "{:e}", (&mass - &nodal).amax());
+        assert!(
+            (&mass - &nodal).amax() < 1e-11 * nodal.amax(),
+            "{:e}",
+            (&mass - &nodal).amax()
+        );
         assert!(nodal.cholesky().is_some(), "positive definite");
 
         // The blocks that the Jacobian uses are the same matrix.
@@ -130,7 +139,10 @@ fn velocity_terms_equal_the_nodal_accelerations() {
             expected[6 + k] += case.frame.damping[k] * rate[k];
         }
         let found = case.residual(&case.v, &still) - case.residual(&still, &still);
-        assert!((&found - &expected).amax() < 1e-11 * expected.amax().max(1e3), "seed {seed}");
+        assert!(
+            (&found - &expected).amax() < 1e-11 * expected.amax().max(1e3),
+            "seed {seed}"
+        );
     }
 }
 
@@ -141,16 +153,34 @@ fn gravity_is_the_weight_of_every_node() {
     let gravity = Vector3::new(0.3, -9.8, 1.0);
     let expected = case.assemble(|_| gravity);
     let (mut rigid, mut modal) = ([0.0; 6], vec![0.0; MODES]);
-    case.frame.subtract_gravity(&case.motion(&still, &still), &gravity, true, &mut rigid, &mut modal);
+    case.frame.subtract_gravity(
+        &case.motion(&still, &still),
+        &gravity,
+        true,
+        &mut rigid,
+        &mut modal,
+    );
     for (found, wanted) in rigid.iter().chain(&modal).zip(expected.iter()) {
         assert!((found + wanted).abs() < 1e-11 * expected.amax());
     }
     // The published convention differs in the moment alone, by the moment of the modal shift.
     let (mut other, mut other_modal) = ([0.0; 6], vec![0.0; MODES]);
-    case.frame.subtract_gravity(&case.motion(&still, &still), &gravity, false, &mut other, &mut other_modal);
+    case.frame.subtract_gravity(
+        &case.motion(&still, &still),
+        &gravity,
+        false,
+        &mut other,
+        &mut other_modal,
+    );
     assert_eq!(modal, other_modal);
     assert_eq!(rigid[..3], other[..3]);
-    let shift: Vector3<f64> = case.frame.c_pt.iter().zip(&case.q[7..]).map(|(c, eta)| c * *eta).sum();
+    let shift: Vector3<f64> = case
+        .frame
+        .c_pt
+        .iter()
+        .zip(&case.q[7..])
+        .map(|(c, eta)| c * *eta)
+        .sum();
     let local = rotation_matrix(&Vector4::from_column_slice(&case.q[3..7])).transpose() * gravity;
     for k in 0..3 {
         assert!((rigid[3 + k] - other[3 + k] + shift.cross(&local)[k]).abs() < 1e-11 * expected.amax());

@@ -2,7 +2,7 @@
 
 use crate::equilibrium::EquilibriumError;
 use crate::integrate::StepError;
-use crate::system::SystemError;
+use crate::simulator::SimulatorError;
 
 /// Why a run has no samples.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -32,9 +32,9 @@ pub enum RunFailure {
     /// The machine does not come to rest at the run's angles.
     #[error("no equilibrium: {0}")]
     NoEquilibrium(#[from] EquilibriumError),
-    /// The machine cannot be built for this payload.
+    /// The machine cannot run at all with this payload.
     #[error(transparent)]
-    System(#[from] SystemError),
+    Machine(#[from] SimulatorError),
     /// The run table does not fit the machine.
     #[error(transparent)]
     Input(#[from] InputError),
