@@ -1,5 +1,11 @@
 //! `hydroflex job`: jobs of a running service.
 
+use crate::client::Client;
+use anyhow::Context;
+use hydroflex_openapi::status::{JobPage, JobState, JobStatus};
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
 /// Where the service is.
 #[derive(Debug, Clone, clap::Args)]
 pub struct ServiceArgs {
@@ -17,7 +23,7 @@ pub enum Command {
     /// Submit a job from a JSON file (`-` for standard input)
     Submit {
         /// Job as JSON
-        file: std::path::PathBuf,
+        file: PathBuf,
         /// Wait until the data set is published and the networks are trained
         #[arg(long)]
         wait: bool,
@@ -60,7 +66,101 @@ pub enum Command {
 /// Runs the command.
 ///
 /// # Errors
-/// Every failure ends the command with its reason.
-pub fn run(_command: Command) -> anyhow::Result<()> {
-    anyhow::bail!("not wired yet")
+/// If the service cannot be reached or refuses, and, for `--wait` and `watch`, if the job does not succeed.
+pub fn run(command: Command) -> anyhow::Result<()> {
+    match command {
+        Command::Submit { file, wait, service } => submit(&file, wait, &service),
+        Command::List { service } => list(&service),
+        Command::Show { job, service } => {
+            let status: JobStatus = Client::new(&service.url)?.get(&format!("/v1/jobs/{job}"))?;
+            print(&status, service.json)
+        }
+        Command::Watch { job, service } => watch(&Client::new(&service.url)?, &job, service.json),
+        Command::Cancel { job, service } => {
+            let client = Client::new(&service.url)?;
+            let status: JobStatus = client.post(&format!("/v1/jobs/{job}/cancel"), &serde_json::json!({}))?;
+            print(&status, service.json)
+        }
+    }
+}
+
+fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> {
+    let mut text = String::new();
+    if file == Path::new("-") {
+        std::io::stdin().read_to_string(&mut text).context("cannot read the job from standard input")?;
+    } else {
+        text = std::fs::read_to_string(file).with_context(|| format!("cannot read the job {}", file.display()))?;
+    }
+    let client = Client::new(&service.url)?;
+    let status: JobStatus = client.post_text("/v1/jobs", text)?;
+    if wait {
+        return watch(&client, &status.job_id.to_string(), service.json);
+    }
+    print(&status, service.json)
+}
+
+fn watch(client: &Client, job: &str, json: bool) -> anyhow::Result<()> {
+    let status = client.follow(job, json)?;
+    print(&status, json)?;
+    if status.state == JobState::Succeeded {
+        return Ok(());
+    }
+    anyhow::bail!("job {} {}: {}", status.job_id, status.state, status.reason.as_deref().unwrap_or("no reason given"))
+}
+
+fn list(service: &ServiceArgs) -> anyhow::Result<()> {
+    let client = Client::new(&service.url)?;
+    let mut path = "/v1/jobs".to_owned();
+    let mut all = Vec::new();
+    loop {
+        let page: JobPage = client.get(&path)?;
+        all.extend(page.jobs);
+        match page.next_cursor {
+            Some(cursor) => path = format!("/v1/jobs?cursor={cursor}"),
+            None => break,
+        }
+    }
+    if service.json {
+        return super::print_json(&all);
+    }
+    super::print_line(format_args!("{:36}  {:10}  {:>16}  created", "job", "state", "runs"))?;
+    for job in &all {
+        super::print_line(format_args!(
+            "{}  {:10}  {:>7} / {:<6}  {}",
+            job.job_id,
+            job.state.as_str(),
+            job.progress.runs_done,
+            job.progress.runs_total,
+            job.created_at
+        ))?;
+    }
+    Ok(())
+}
+
+fn print(status: &JobStatus, json: bool) -> anyhow::Result<()> {
+    if json {
+        return super::print_json(status);
+    }
+    let progress = &status.progress;
+    super::print_line(format_args!("job      {}", status.job_id))?;
+    super::print_line(format_args!("state    {}", status.state))?;
+    if let Some(reason) = &status.reason {
+        super::print_line(format_args!("reason   {reason}"))?;
+    }
+    super::print_line(format_args!(
+        "runs     {} of {} done, {} failed",
+        progress.runs_done, progress.runs_total, progress.runs_failed
+    ))?;
+    if let (Some(id), Some(sha256)) = (&status.dataset_id, &status.dataset_sha256) {
+        super::print_line(format_args!("data set {id} (SHA-256 {sha256})"))?;
+    }
+    for training in &status.trainings {
+        let outcome = match (&training.model_id, &training.reason) {
+            (Some(model), _) => format!("model {model}"),
+            (None, Some(reason)) => reason.clone(),
+            (None, None) => String::new(),
+        };
+        super::print_line(format_args!("training {} {} {outcome}", training.spec.structure, training.state))?;
+    }
+    Ok(())
 }

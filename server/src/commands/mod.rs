@@ -11,3 +11,23 @@ pub mod train;
 pub mod evaluate;
 pub mod model;
 pub mod predict;
+
+use anyhow::Context as _;
+use std::io::Write as _;
+
+/// Prints a line for people to standard output. A closed pipe ends the command instead of a panic.
+///
+/// # Errors
+/// If standard output cannot be written.
+pub(crate) fn print_line(line: std::fmt::Arguments<'_>) -> anyhow::Result<()> {
+    writeln!(std::io::stdout().lock(), "{line}").context("cannot write to standard output")
+}
+
+/// Prints a value as one JSON document, for scripts.
+///
+/// # Errors
+/// If standard output cannot be written.
+pub(crate) fn print_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
+    let text = serde_json::to_string_pretty(value).context("cannot write as JSON")?;
+    print_line(format_args!("{text}"))
+}
