@@ -11,6 +11,7 @@ pub mod system;
 pub mod integrate;
 pub mod equilibrium;
 pub mod trajectory;
+mod general;
 pub mod simulator;
 
 #[cfg(test)]

@@ -8,13 +8,13 @@ use hydroflex_openapi::job::Integrator;
 use hydroflex_openapi::machine::MachineFile;
 
 use crate::equilibrium::{Equilibrium, equilibrium};
-use crate::integrate::{Scheme, Stepper};
+use crate::general::GeneralRun;
+use crate::integrate::Scheme;
 use crate::machine::Machine;
 use crate::reduction::{ReducedBody, ReductionError};
 use crate::system::{System, SystemError};
-use crate::trajectory::recorder::{FlagSet, Recorder};
+use crate::trajectory::recorder::Recorder;
 use crate::trajectory::{InputError, RunFailure, RunInput, RunSettings, Trajectory, channels};
-use hydroflex_openapi::job::RunFlag;
 
 /// Spectral radius of the generalised-α scheme that runs can ask for.
 const SPECTRAL_RADIUS: f64 = 0.7;
@@ -137,110 +137,38 @@ impl Simulator {
     /// # Errors
     /// Where a run fails: it is data, with its reason.
     pub fn run(&self, input: &RunInput, settings: &RunSettings) -> Result<Trajectory, RunFailure> {
-        let samples = check(self.machine.file(), input, settings)?;
+        check(self.machine.file(), input, settings)?;
         let variant = self.variant(input.payload_kg > 0.0)?;
         let system = variant.system.with_payload_mass(input.payload_kg);
-        let (scheme, step_s) = match settings.integrator {
-            Integrator::TrapezoidalIndex2 { step_s } => (Scheme::TRAPEZOIDAL_INDEX_2, step_s),
-            Integrator::GeneralizedAlpha { step_s } => (Scheme::generalized_alpha(SPECTRAL_RADIUS), step_s),
-            Integrator::Accurate => (Scheme::generalized_alpha(SPECTRAL_RADIUS), 1e-4),
-        };
-        let steps_per_sample = steps_per_sample(settings.sample_time_s, step_s)?;
         let start = equilibrium(
             &system,
             self.machine.file(),
             &input.angles_rad,
             &mut system.new_workspace(),
         )?;
-        let fixed = FixedStep {
-            samples,
+        let run = GeneralRun {
+            system: &system,
+            recorder: &variant.recorder,
+            start: &start.state,
+            valves_ratio: &input.valves_ratio,
             sample_time_s: settings.sample_time_s,
-            steps_per_sample,
         };
-        fixed.run(&system, &variant.recorder, scheme, start, input)
-    }
-}
-
-/// A run with a fixed number of steps per sample.
-#[derive(Debug, Clone, Copy)]
-struct FixedStep {
-    samples: usize,
-    sample_time_s: f64,
-    steps_per_sample: u32,
-}
-
-impl FixedStep {
-    fn run(
-        self,
-        system: &System,
-        recorder: &Recorder,
-        scheme: Scheme,
-        start: Equilibrium,
-        input: &RunInput,
-    ) -> Result<Trajectory, RunFailure> {
-        let cylinders = system.cylinders();
-        let step_s = self.sample_time_s / f64::from(self.steps_per_sample);
-        let signal = |cylinder: usize, sample: usize| {
-            if sample == 0 {
-                0.0
-            } else {
-                input.valves_ratio[cylinder][sample - 1]
+        match settings.integrator {
+            Integrator::TrapezoidalIndex2 { step_s } => {
+                let steps = steps_per_sample(settings.sample_time_s, step_s)?;
+                run.fixed(Scheme::TRAPEZOIDAL_INDEX_2, steps)
             }
-        };
-        let mut columns = recorder.new_columns(self.samples + 1);
-        let mut flags = FlagSet::default();
-        let (mut from, mut to) = (vec![0.0; cylinders.len()], vec![0.0; cylinders.len()]);
-        let mut stepper = Stepper::new(system, scheme, start.state)?;
-        recorder.record(
-            system,
-            &stepper.state,
-            &stepper.workspace,
-            |k| signal(k, 0),
-            &mut columns,
-        );
-        for sample in 1..=self.samples {
-            for step in 1..=self.steps_per_sample {
-                for (k, cylinder) in cylinders.iter().enumerate() {
-                    let (before, after) = (signal(k, sample - 1), signal(k, sample));
-                    let part = |i: u32| f64::from(i) / f64::from(self.steps_per_sample);
-                    from[k] = before + (after - before) * part(step - 1);
-                    // The last step ends exactly on the sample's value.
-                    to[k] = if step == self.steps_per_sample {
-                        after
-                    } else {
-                        before + (after - before) * part(step)
-                    };
-                    if cylinder.is_cut_off(stepper.workspace.cylinders[k].length_m) {
-                        (from[k], to[k]) = (0.0, 0.0);
-                        flags.set(RunFlag::StrokeCutoff);
-                    }
-                }
-                let t_s = self.sample_time_s * (sample - 1) as f64 + step_s * f64::from(step - 1);
-                stepper.advance(t_s, step_s, &from, &to)?;
-                for (k, cylinder) in cylinders.iter().enumerate() {
-                    let length_m = stepper.workspace.cylinders[k].length_m;
-                    flags.watch(cylinder, length_m, stepper.state.pressures_pa[k]);
-                }
+            Integrator::GeneralizedAlpha { step_s } => {
+                let steps = steps_per_sample(settings.sample_time_s, step_s)?;
+                run.fixed(Scheme::generalized_alpha(SPECTRAL_RADIUS), steps)
             }
-            recorder.record(
-                system,
-                &stepper.state,
-                &stepper.workspace,
-                |k| signal(k, sample),
-                &mut columns,
-            );
+            Integrator::Accurate => run.accurate(&self.channels),
         }
-        Ok(Trajectory {
-            sample_count: self.samples + 1,
-            columns,
-            flags: flags.list(),
-            statistics: stepper.statistics,
-        })
     }
 }
 
-/// Checks a run against the machine; returns its number of samples after the first.
-fn check(file: &MachineFile, input: &RunInput, settings: &RunSettings) -> Result<usize, InputError> {
+/// Checks a run against the machine.
+fn check(file: &MachineFile, input: &RunInput, settings: &RunSettings) -> Result<(), InputError> {
     if input.valves_ratio.len() != file.cylinders.len() {
         return Err(InputError::ValveCount {
             given: input.valves_ratio.len(),
@@ -293,7 +221,7 @@ fn check(file: &MachineFile, input: &RunInput, settings: &RunSettings) -> Result
             allowed: "a number of radians",
         });
     }
-    Ok(samples)
+    Ok(())
 }
 
 /// Whole number of steps in a sample.

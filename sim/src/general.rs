@@ -1,0 +1,196 @@
+//! The general path: a run in redundant coordinates, for any machine.
+
+use hydroflex_openapi::channel::Channel;
+use hydroflex_openapi::job::RunFlag;
+
+use crate::integrate::{Scheme, Stepper};
+use crate::system::{State, System};
+use crate::trajectory::recorder::{FlagSet, Recorder};
+use crate::trajectory::{RunFailure, Trajectory};
+
+/// Spectral radius of the scheme behind accurate runs: it damps what no step resolves, and keeps
+/// the joints closed.
+const SPECTRAL_RADIUS: f64 = 0.7;
+/// Longest step with which an accurate run starts, s.
+const STEP_LONGEST_S: f64 = 6.3e-4;
+/// Shortest one, s. Runs whose valve chatters at the stroke cut-off never settle; they end here.
+const STEP_SHORTEST_S: f64 = 1e-5;
+/// Largest allowed change of a channel between the last two step sizes, relative to the channel's range. Halving
+/// the step of a second-order scheme leaves a third of that change as error.
+const CHANGE_MOST: f64 = 1e-3;
+
+/// One run and what it needs.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct GeneralRun<'a> {
+    pub(crate) system: &'a System,
+    pub(crate) recorder: &'a Recorder,
+    pub(crate) start: &'a State,
+    /// One list per cylinder, all of one length.
+    pub(crate) valves_ratio: &'a [Vec<f64>],
+    pub(crate) sample_time_s: f64,
+}
+
+/// Where steps end within a sample.
+#[derive(Debug, Clone, Copy)]
+struct Grid {
+    steps_per_sample: u32,
+    /// Also where a valve signal crosses zero: there the metering edge changes, and a step across
+    /// that kink would lose the scheme's order.
+    split_at_zero: bool,
+}
+
+impl GeneralRun<'_> {
+    /// A fixed number of equal steps per sample.
+    pub(crate) fn fixed(&self, scheme: Scheme, steps_per_sample: u32) -> Result<Trajectory, RunFailure> {
+        let grid = Grid {
+            steps_per_sample,
+            split_at_zero: false,
+        };
+        self.march(scheme, grid)
+    }
+
+    /// Halves the step until no channel but accelerations changes by more than [`CHANGE_MOST`] of its range.
+    pub(crate) fn accurate(&self, channels: &[Channel]) -> Result<Trajectory, RunFailure> {
+        let scheme = Scheme::generalized_alpha(SPECTRAL_RADIUS);
+        let resolutions: Vec<f64> = channels.iter().map(resolution).collect();
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "small and positive"
+        )]
+        let mut steps = (self.sample_time_s / STEP_LONGEST_S).ceil().clamp(1.0, 1e6) as u32;
+        let grid = |steps_per_sample| Grid {
+            steps_per_sample,
+            split_at_zero: true,
+        };
+        let mut coarse = self.march(scheme, grid(steps))?;
+        loop {
+            steps *= 2;
+            let mut fine = self.march(scheme, grid(steps))?;
+            fine.statistics.steps += coarse.statistics.steps;
+            fine.statistics.rejected += coarse.statistics.rejected;
+            fine.statistics.iterations += coarse.statistics.iterations;
+            fine.statistics.factorisations += coarse.statistics.factorisations;
+            let settled = change(&coarse, &fine, &resolutions) <= CHANGE_MOST;
+            if settled || self.sample_time_s / f64::from(steps) < STEP_SHORTEST_S {
+                return Ok(fine);
+            }
+            coarse = fine;
+        }
+    }
+
+    /// Valve of a cylinder at a sample; the signal starts at zero.
+    fn valve(&self, cylinder: usize, sample: usize) -> f64 {
+        if sample == 0 {
+            0.0
+        } else {
+            self.valves_ratio[cylinder][sample - 1]
+        }
+    }
+
+    fn march(&self, scheme: Scheme, grid: Grid) -> Result<Trajectory, RunFailure> {
+        let cylinders = self.system.cylinders();
+        let samples = self.valves_ratio.first().map_or(0, Vec::len);
+        let mut columns = self.recorder.new_columns(samples + 1);
+        let mut flags = FlagSet::default();
+        let (mut from, mut to) = (vec![0.0; cylinders.len()], vec![0.0; cylinders.len()]);
+        let mut ends = Vec::with_capacity(2 * grid.steps_per_sample as usize + 2 * cylinders.len() + 2);
+        let mut stepper = Stepper::new(self.system, scheme, self.start.clone())?;
+        let record = |stepper: &Stepper<'_>, sample, columns: &mut Vec<Vec<f64>>| {
+            let valves = |k| self.valve(k, sample);
+            self.recorder
+                .record(self.system, &stepper.state, &stepper.workspace, valves, columns);
+        };
+        record(&stepper, 0, &mut columns);
+        for sample in 1..=samples {
+            self.step_ends(grid, sample, &mut ends);
+            let mut begin = 0.0;
+            for &end in &ends {
+                for (k, cylinder) in cylinders.iter().enumerate() {
+                    let (before, after) = (self.valve(k, sample - 1), self.valve(k, sample));
+                    from[k] = before + (after - before) * begin;
+                    // The last step ends exactly on the sample's value.
+                    to[k] = if end >= 1.0 {
+                        after
+                    } else {
+                        before + (after - before) * end
+                    };
+                    if cylinder.is_cut_off(stepper.workspace.cylinders[k].length_m) {
+                        (from[k], to[k]) = (0.0, 0.0);
+                        flags.set(RunFlag::StrokeCutoff);
+                    }
+                }
+                let t_s = self.sample_time_s * ((sample - 1) as f64 + begin);
+                stepper.advance(t_s, self.sample_time_s * (end - begin), &from, &to)?;
+                for (k, cylinder) in cylinders.iter().enumerate() {
+                    let length_m = stepper.workspace.cylinders[k].length_m;
+                    flags.watch(cylinder, length_m, stepper.state.pressures_pa[k]);
+                }
+                begin = end;
+            }
+            record(&stepper, sample, &mut columns);
+        }
+        Ok(Trajectory {
+            sample_count: samples + 1,
+            columns,
+            flags: flags.list(),
+            statistics: stepper.statistics,
+        })
+    }
+
+    /// Ends of the steps of a sample, as parts of it: ascending, the last one is 1.
+    fn step_ends(&self, grid: Grid, sample: usize, ends: &mut Vec<f64>) {
+        ends.clear();
+        let total = f64::from(grid.steps_per_sample);
+        ends.extend((1..grid.steps_per_sample).map(|k| f64::from(k) / total));
+        ends.push(1.0);
+        if grid.split_at_zero {
+            for k in 0..self.valves_ratio.len() {
+                let (before, after) = (self.valve(k, sample - 1), self.valve(k, sample));
+                if before * after < 0.0 {
+                    ends.push(before / (before - after));
+                }
+            }
+            ends.sort_unstable_by(f64::total_cmp);
+            // A sliver of a step would only cost; the kink is then close enough to a step's end.
+            let least = 1e-3 / total;
+            let mut last = 0.0;
+            ends.retain(|&end| {
+                let keep = end >= 1.0 || (end - last > least && 1.0 - end > least);
+                if keep {
+                    last = end;
+                }
+                keep
+            });
+        }
+    }
+}
+
+/// Largest difference of a channel, relative to its range in the finer run or to its resolution, whichever
+/// is larger.
+fn change(coarse: &Trajectory, fine: &Trajectory, resolutions: &[f64]) -> f64 {
+    let mut largest = 0.0_f64;
+    for ((a, b), resolution) in coarse.columns.iter().zip(&fine.columns).zip(resolutions) {
+        let (low, high) = b.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| {
+            (l.min(*x), h.max(*x))
+        });
+        let scale = (high - low).max(*resolution);
+        for (x, y) in a.iter().zip(b) {
+            largest = largest.max((x - y).abs() / scale);
+        }
+    }
+    largest
+}
+
+/// Range below which a channel counts as still: a machine at rest need not be resolved in its
+/// rounding. Accelerations are never judged.
+fn resolution(channel: &Channel) -> f64 {
+    match channel.unit.as_str() {
+        "m" | "rad" => 1e-5,
+        "m/s" | "rad/s" => 1e-4,
+        "Pa" => 1e4,
+        "N" => 1e2,
+        "rad/s^2" => f64::INFINITY,
+        _ => 1e-8,
+    }
+}
