@@ -1,1 +1,28 @@
-//! SLIDE networks: windows, training, evaluation, prediction
+//! SLIDE networks: windows, training, evaluation, prediction.
+//!
+//! ```text
+//! Dataset → Runs → windows (index arithmetic) → scaled batch → network → model folder → Predictor
+//! ```
+//!
+//! A SLIDE network (Manzl et al. 2024) estimates a structural quantity at time t from the sensor
+//! samples of a window that ends at t. The window is as long as a disturbance needs to decay, so
+//! what happened before it does not matter and no initial state is fed.
+//!
+//! * [`runs`], [`window`], [`scaling`]: recorded signals, and how windows are cut from them.
+//! * [`structure`], [`network`]: what can be trained; the letters are the paper's.
+//! * [`least_squares`]: the best linear map of a window, baseline and skip connection in one.
+//! * [`train`]: the training loop on burn tensors, with checkpoints.
+//! * [`model`]: the model folder; [`predict`]: estimates without the tensor framework.
+//! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
+
+pub mod runs;
+pub mod window;
+pub mod scaling;
+pub mod structure;
+pub mod least_squares;
+pub mod network;
+//pub mod train;
+//pub mod model;
+//pub mod predict;
+//pub mod evaluate;
+//pub mod plot;

@@ -13,3 +13,4 @@ pub mod event;
 pub mod catalogue;
 pub mod prediction;
 pub mod problem;
+pub mod model;

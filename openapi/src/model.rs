@@ -1,0 +1,284 @@
+//! A trained model as stored and sent: `config.json` of a model folder, its metrics, a training's
+//! progress and result.
+//!
+//! Quantities are in the unit of their column. Nothing here depends on the time or the host of a
+//! training, so the same seed gives the same folder, byte for byte.
+
+use crate::job::TrainingSpec;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// Version of [`ModelConfig`] that this code writes.
+pub const MODEL_FORMAT_VERSION: u32 = 1;
+
+/// `config.json` of a model folder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// [`MODEL_FORMAT_VERSION`] of the writer.
+    pub format_version: u32,
+    /// `best`, or the letters of the paper.
+    pub structure: String,
+    /// Samples in a window; the estimate belongs to the last one.
+    pub window_steps: usize,
+    /// Window in time, `window_steps · sample_time_s`.
+    pub window_s: f64,
+    /// Time between samples.
+    pub sample_time_s: f64,
+    /// Channels in, in the order in which they stand in a window row.
+    pub inputs: Vec<ScaledChannel>,
+    /// Channels out.
+    pub targets: Vec<ScaledChannel>,
+    /// Whether a linear map of the window (`skip.*`) is added to the network's output.
+    pub linear_skip: bool,
+    /// Layers of the network (`net.*`), first to last; empty when the skip is the whole model.
+    pub layers: Vec<DenseLayer>,
+    /// Where the model comes from.
+    pub provenance: ModelProvenance,
+    /// Errors on the validation runs, single step, one per target.
+    pub validation: Vec<TargetMetrics>,
+    /// The same errors for least squares on the same windows.
+    pub validation_least_squares: Vec<TargetMetrics>,
+    /// Half widths of 90 % intervals, one per target; absent when too few validation windows.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub intervals: Vec<IntervalTable>,
+    /// The region of inputs that the model was trained on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub envelope: Option<Envelope>,
+    /// Windows with their estimates, checked whenever the model is loaded.
+    pub golden: Vec<GoldenPrediction>,
+}
+
+/// A channel with the affine map into the network's numbers: `scaled = (value − offset) / scale`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ScaledChannel {
+    /// Column name, unit last.
+    pub name: String,
+    /// Unit as text.
+    pub unit: String,
+    /// Offset, in the column's unit.
+    pub offset: f64,
+    /// Scale, in the column's unit, positive.
+    pub scale: f64,
+}
+
+/// `output = activation(weight · input + bias)`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DenseLayer {
+    /// Prefix of the layer's tensors: `net.0` owns `net.0.weight` (outputs × inputs) and `net.0.bias`.
+    pub name: String,
+    /// Values in.
+    pub inputs: usize,
+    /// Values out.
+    pub outputs: usize,
+    /// Applied one after the other to each output; most layers have one, the last has none.
+    pub activations: Vec<Activation>,
+}
+
+/// Scalar function after a layer; the letter is the paper's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Activation {
+    /// `T`: tanh x.
+    Tanh,
+    /// `S`: 1 / (1 + e⁻ˣ).
+    Sigmoid,
+    /// `R`: max(x, 0).
+    Relu,
+    /// `E`: x for x > 0, eˣ − 1 otherwise.
+    Elu,
+    /// x / (1 + e⁻ˣ).
+    Silu,
+}
+
+/// Where a model comes from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ModelProvenance {
+    /// What was asked for, defaults filled in.
+    pub spec: TrainingSpec,
+    /// Hash of the data set (SHA-256 of its `SHA256SUMS`), or of the samples where it has none.
+    pub dataset_sha256: String,
+    /// Training runs used.
+    pub train_runs: usize,
+    /// Validation runs used.
+    pub validation_runs: usize,
+    /// Training windows in an epoch.
+    pub train_windows: usize,
+    /// Epochs done.
+    pub epochs: usize,
+    /// Epoch whose weights were kept.
+    pub best_epoch: usize,
+    /// Adam's learning rate at the start.
+    pub learning_rate: f64,
+    /// Windows per batch.
+    pub batch: usize,
+    /// Ridge of the linear map, relative to the largest eigenvalue of the windows' covariance.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ridge: Option<f64>,
+    /// Learning curve.
+    pub history: Vec<EpochRecord>,
+    /// Why the training ended.
+    pub ended_by: TrainingEnd,
+    /// Version of hydroflex.
+    pub hydroflex_version: String,
+    /// Version of the tensor framework.
+    pub burn_version: String,
+}
+
+/// A point of the learning curve: mean squared errors of the network's scaled outputs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EpochRecord {
+    /// Epochs done.
+    pub epoch: usize,
+    /// Training windows, mean over the epoch.
+    pub train_loss: f64,
+    /// Validation windows.
+    pub validation_loss: f64,
+}
+
+/// Why a training ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum TrainingEnd {
+    /// The number of epochs was reached.
+    Epochs,
+    /// The time limit was reached.
+    TimeLimit,
+    /// The training loss fell below the threshold.
+    LossThreshold,
+    /// The validation error had not improved for a long time.
+    EarlyStopping,
+    /// Nothing to iterate: the linear map alone.
+    LeastSquares,
+}
+
+/// Errors of one target, in its column's unit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TargetMetrics {
+    /// Column.
+    pub target: String,
+    /// Its unit.
+    pub unit: String,
+    /// Estimates compared.
+    pub samples: u64,
+    /// Mean absolute error.
+    pub mae: f64,
+    /// Root of the mean squared error.
+    pub rmse: f64,
+    /// Largest absolute error.
+    pub max: f64,
+    /// 95th percentile of the absolute error.
+    pub p95: f64,
+    /// Largest minus smallest reference value.
+    pub range: f64,
+    /// `mae / range`; 0 when the reference is constant.
+    pub mae_relative_to_range: f64,
+    /// Coefficient of determination; 0 when the reference is constant.
+    pub r2: f64,
+    /// Part of the samples inside the 90 % interval, where the model has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub coverage: Option<f64>,
+}
+
+/// 90 % intervals by conformal prediction, in classes of the estimate's distance from the target's
+/// mean: an estimate `y` has the half width of the first class whose `upper_edge ≥ |y − centre|`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct IntervalTable {
+    /// Centre of the classes, in the column's unit.
+    pub centre: f64,
+    /// Upper edges of the classes but the last, ascending, in the column's unit.
+    pub upper_edges: Vec<f64>,
+    /// Half widths, one per class, in the column's unit.
+    pub half_widths: Vec<f64>,
+}
+
+/// Region of the training windows: a window is inside when its squared distance from the mean,
+/// weighted by the inverse covariance (tensor `envelope.projection` of `auxiliary.safetensors`), is at most `limit`, and
+/// every value is within the range of its channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Envelope {
+    /// Rows of `envelope.projection`.
+    pub components: usize,
+    /// Largest squared norm of the projected window, per component.
+    pub limit: f64,
+    /// Smallest value of each input, in its column's unit.
+    pub min: Vec<f64>,
+    /// Largest value of each input, in its column's unit.
+    pub max: Vec<f64>,
+}
+
+/// A window and what the model says about it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GoldenPrediction {
+    /// `window_steps` rows of the inputs, row by row, in the columns' units.
+    pub window: Vec<f64>,
+    /// One estimate per target, in the columns' units.
+    pub estimates: Vec<f64>,
+}
+
+/// Result of a training.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ModelSummary {
+    /// SHA-256 over the files of the model folder.
+    pub model_sha256: String,
+    /// Hash of the data set.
+    pub dataset_sha256: String,
+    /// Structure.
+    pub structure: String,
+    /// Channels in.
+    pub inputs: Vec<String>,
+    /// Channels out.
+    pub targets: Vec<String>,
+    /// Samples in a window.
+    pub window_steps: usize,
+    /// Window in time.
+    pub window_s: f64,
+    /// Epochs done.
+    pub epochs: usize,
+    /// Why the training ended.
+    pub ended_by: TrainingEnd,
+    /// Weights and biases.
+    pub parameters: usize,
+    /// Time spent training, of all attempts together.
+    pub train_seconds: f64,
+    /// Errors on the validation runs.
+    pub validation: Vec<TargetMetrics>,
+    /// The same for least squares on the same windows.
+    pub validation_least_squares: Vec<TargetMetrics>,
+}
+
+/// Result of `hydroflex evaluate`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct EvaluationReport {
+    /// Hash of the model folder.
+    pub model_sha256: String,
+    /// Hash of the data set.
+    pub dataset_sha256: String,
+    /// Runs evaluated.
+    pub runs: usize,
+    /// Errors of the model, one per target.
+    pub targets: Vec<TargetMetrics>,
+    /// Errors of simple estimators on the same samples.
+    pub baselines: Vec<BaselineMetrics>,
+    /// Part of the windows inside the model's envelope, where it has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inside_envelope: Option<f64>,
+}
+
+/// Errors of a simple estimator.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct BaselineMetrics {
+    /// `least_squares`: linear map of the same window, fitted on the model's training runs;
+    /// `quasi_static`: linear map of the window's last row.
+    pub name: String,
+    /// One per target.
+    pub targets: Vec<TargetMetrics>,
+}
