@@ -16,13 +16,14 @@
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
 
 pub mod runs;
+pub mod recording;
 pub mod window;
 pub mod scaling;
 pub mod structure;
 pub mod least_squares;
 pub mod network;
-//pub mod train;
-//pub mod model;
-//pub mod predict;
-//pub mod evaluate;
+pub mod train;
+pub mod model;
+pub mod predict;
+pub mod evaluate;
 //pub mod plot;

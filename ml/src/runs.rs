@@ -1,25 +1,17 @@
 //! Recorded runs in memory, column by column.
 
+use hydroflex_openapi::channel::Channel;
 use std::collections::HashMap;
 
 /// Runs of one machine with the same channels and the same time between samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Runs {
     /// Channels, in the order of every run's columns.
-    pub channels: Vec<ChannelInfo>,
+    pub channels: Vec<Channel>,
     /// Time between samples, s.
     pub sample_time_s: f64,
     /// Runs, in run order.
     pub runs: Vec<RunSamples>,
-}
-
-/// Name and unit of a column.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ChannelInfo {
-    /// Column name, unit last.
-    pub name: String,
-    /// Unit as text.
-    pub unit: String,
 }
 
 /// Samples of one run.
@@ -163,9 +155,16 @@ impl Runs {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hydroflex_openapi::channel::ChannelRole;
 
     fn runs() -> Runs {
-        let channel = |name: &str| ChannelInfo { name: name.to_owned(), unit: "1".to_owned() };
+        let channel = |name: &str| Channel {
+            name: name.to_owned(),
+            unit: "1".to_owned(),
+            quantity: String::new(),
+            frame: None,
+            role: ChannelRole::Sensor,
+        };
         Runs {
             channels: vec![channel("a"), channel("b")],
             sample_time_s: 0.005,

@@ -1,6 +1,7 @@
 //! Scales between columns in SI units and the network's numbers.
 
-use crate::runs::{ChannelInfo, Runs};
+use crate::runs::Runs;
+use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::model::ScaledChannel;
 
 /// One affine map per channel: `scaled = (value − offset) / scale`.
@@ -115,7 +116,7 @@ impl Scaling {
     }
 }
 
-fn scaled(channel: &ChannelInfo, offset: f64, scale: f64) -> ScaledChannel {
+fn scaled(channel: &Channel, offset: f64, scale: f64) -> ScaledChannel {
     ScaledChannel { name: channel.name.clone(), unit: channel.unit.clone(), offset, scale }
 }
 
@@ -135,9 +136,16 @@ fn mean_and_std(values: impl Iterator<Item = f64>) -> (f64, f64) {
 mod tests {
     use super::*;
     use crate::runs::RunSamples;
+    use hydroflex_openapi::channel::ChannelRole;
 
     fn runs() -> Runs {
-        let channel = |name: &str| ChannelInfo { name: name.to_owned(), unit: String::new() };
+        let channel = |name: &str| Channel {
+            name: name.to_owned(),
+            unit: String::new(),
+            quantity: String::new(),
+            frame: None,
+            role: ChannelRole::Sensor,
+        };
         Runs {
             channels: vec![channel("pressure_lift_piston_pa"), channel("angle_lift_rad")],
             sample_time_s: 0.005,

@@ -111,6 +111,7 @@ pub fn saves_input(activation: Activation) -> bool {
     activation == Activation::Silu
 }
 
+/// Compiles a loop for the baseline and for AVX2 + FMA, and chooses at run time.
 macro_rules! vectorised {
     ($(#[$doc:meta])* $name:ident, $generic:ident, ($($arg:ident: $ty:ty),*)) => {
         $(#[$doc])*
@@ -134,6 +135,7 @@ macro_rules! vectorised {
         }
     };
 }
+pub(crate) use vectorised;
 
 vectorised!(
     /// Applies `activation` to every value.

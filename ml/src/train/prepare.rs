@@ -1,0 +1,341 @@
+//! From a data set and a specification to a well-posed training problem.
+
+use super::TrainError;
+use crate::least_squares::{LinearMap, Spectrum, TargetRows, WindowMoments};
+use crate::network::init::initial_parameters;
+use crate::runs::Runs;
+use crate::scaling::Scaling;
+use crate::structure::Structure;
+use crate::window::{Series, WindowError, Windows, window_steps};
+use hydroflex_openapi::channel::{Channel, ChannelRole};
+use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
+use hydroflex_openapi::model::DenseLayer;
+
+/// Fewest training runs: with fewer the scales and the linear map say nothing about other runs.
+pub const MIN_TRAIN_RUNS: usize = 2;
+
+/// Steps of a training of our own when neither epochs nor a time limit are given.
+const DEFAULT_STEPS: usize = 6000;
+/// Most epochs of the paper's recipe.
+const PAPER_EPOCHS: usize = 1000;
+/// The paper's recipe stops at this training loss.
+const PAPER_LOSS_THRESHOLD: f64 = 5e-6;
+/// The paper's learning rate.
+const PAPER_LEARNING_RATE: f64 = 1e-4;
+/// Ours.
+const LEARNING_RATE: f64 = 1e-3;
+/// Our batch.
+const BATCH: usize = 1024;
+
+/// Whitening keeps directions whose variance exceeds this part of the largest …
+const WHITENING_CUT: f64 = 1e-9;
+/// … and divides by the root of variance plus this part of the largest, so that directions that
+/// hold only rounding are not blown up to unit size.
+const WHITENING_FLOOR: f64 = 1e-8;
+
+/// Runs to learn from, with all the channels of their data set.
+#[derive(Debug, Clone)]
+pub struct TrainingData {
+    /// Runs whose errors are minimised.
+    pub train: Runs,
+    /// Runs that choose the ridge and the best epoch.
+    pub validation: Runs,
+    /// Hash of the data set.
+    pub dataset_sha256: String,
+}
+
+/// How a training proceeds, defaults filled in.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recipe {
+    /// Largest number of epochs.
+    pub epochs: usize,
+    /// Largest training time, s.
+    pub time_limit_s: Option<f64>,
+    /// Learning rate at the start.
+    pub learning_rate: f64,
+    /// Whether it falls to zero along a cosine.
+    pub cosine: bool,
+    /// Windows per batch.
+    pub batch: usize,
+    /// Training loss at which to stop.
+    pub loss_threshold: Option<f64>,
+    /// Seed.
+    pub seed: u64,
+}
+
+/// Windows of one part of the runs with what the network shall say at their ends.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// Scaled inputs.
+    pub series: Series,
+    /// Windows.
+    pub windows: Windows,
+    /// What the network learns, row by row as the series: scaled targets, or what the linear map
+    /// leaves over, in units of its standard deviation.
+    pub wanted: Vec<f32>,
+    /// Scaled targets in f64.
+    pub targets: TargetRows,
+}
+
+/// Everything that the training loop needs.
+#[derive(Debug, Clone)]
+pub struct Problem {
+    /// The specification with defaults filled in.
+    pub spec: TrainingSpec,
+    /// Structure.
+    pub structure: Structure,
+    /// Samples in a window.
+    pub steps: usize,
+    /// Scales of the inputs.
+    pub input_scaling: Scaling,
+    /// Scales of the targets.
+    pub target_scaling: Scaling,
+    /// Training part.
+    pub train: Part,
+    /// Validation part.
+    pub validation: Part,
+    /// Moments of the training windows.
+    pub moments: WindowMoments,
+    /// Their spectrum.
+    pub spectrum: Spectrum,
+    /// Least squares on the window: baseline of every model, skip connection of ours.
+    pub linear: LinearMap,
+    /// Standard deviation of what the network learns, per target, in scaled units (1 without skip).
+    pub wanted_scale: Vec<f64>,
+    /// Rows that whiten a window, and what they make of the mean window; empty for the paper's recipe.
+    pub whitening: Whitening,
+    /// Layers as trained: the first one takes the whitened window.
+    pub layers: Vec<DenseLayer>,
+    /// Weights at the start.
+    pub parameters: Vec<f32>,
+    /// How to proceed.
+    pub recipe: Recipe,
+}
+
+/// `z = P x − P x̄`, folded into the first layer when the training is over.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Whitening {
+    /// components × window values, row-major.
+    pub projection: Vec<f32>,
+    /// −P x̄.
+    pub offset: Vec<f32>,
+}
+
+impl Whitening {
+    /// Number of components.
+    #[must_use]
+    pub fn components(&self) -> usize {
+        self.offset.len()
+    }
+}
+
+/// Inputs by default: valve, length, velocity and both pressures of every cylinder.
+#[must_use]
+pub fn default_inputs(channels: &[Channel]) -> Vec<String> {
+    let wanted = ["valve_", "length_", "velocity_", "pressure_"];
+    let is_input = |c: &&Channel| c.role != ChannelRole::Target && wanted.iter().any(|w| c.name.starts_with(w));
+    channels.iter().filter(is_input).map(|c| c.name.clone()).collect()
+}
+
+/// Targets by default: every structural channel except axial and out-of-plane deflection.
+#[must_use]
+pub fn default_targets(channels: &[Channel]) -> Vec<String> {
+    let secondary = |name: &str| name.starts_with("deflection_") && (name.ends_with("_x_m") || name.ends_with("_z_m"));
+    channels.iter().filter(|c| c.role == ChannelRole::Target && !secondary(&c.name)).map(|c| c.name.clone()).collect()
+}
+
+impl Problem {
+    /// Checks the data against the specification and fits everything that has a closed form.
+    ///
+    /// # Errors
+    /// The data cannot answer the specification.
+    pub fn new(data: &TrainingData, spec: &TrainingSpec) -> Result<Self, TrainError> {
+        let spec = with_defaults(data, spec);
+        check_names(&spec)?;
+        let train_inputs = data.train.select(&spec.inputs)?;
+        let train_targets = data.train.select(&spec.targets)?;
+        let validation_inputs = data.validation.select(&spec.inputs)?;
+        let validation_targets = data.validation.select(&spec.targets)?;
+        for runs in [&train_inputs, &train_targets, &validation_inputs, &validation_targets] {
+            runs.check()?;
+        }
+        let published = spec.windows == WindowCut::Disjoint;
+        let steps = match spec.window {
+            WindowRule::Given { window_s } => window_steps(window_s, data.train.sample_time_s)?,
+            _ => return Err(TrainError::NoWindow),
+        };
+        let structure = Structure::parse(&spec.structure, steps, spec.width)?;
+
+        let scaling: fn(&Runs) -> Scaling = if published { Scaling::paper } else { Scaling::fit };
+        let (input_scaling, target_scaling) = (scaling(&train_inputs), scaling(&train_targets));
+        let part = |inputs: &Runs, targets: &Runs, cut| -> Result<Part, TrainError> {
+            let series = Series::new(inputs, &input_scaling);
+            let windows = Windows::new(&series.run_rows, steps, cut);
+            check_lengths(inputs, steps, &windows)?;
+            Ok(Part { targets: target_rows(targets, &target_scaling), series, windows, wanted: Vec::new() })
+        };
+        if data.train.runs.len() < MIN_TRAIN_RUNS || data.validation.runs.is_empty() {
+            return Err(TrainError::TooFewRuns {
+                train: data.train.runs.len(),
+                validation: data.validation.runs.len(),
+            });
+        }
+        let mut train = part(&train_inputs, &train_targets, spec.windows)?;
+        let mut validation = part(&validation_inputs, &validation_targets, WindowCut::Overlapping)?;
+
+        // The linear map uses every window even where the network gets the published few.
+        let every = Windows::new(&train.series.run_rows, steps, WindowCut::Overlapping);
+        let moments = WindowMoments::gather(&train.series, &every, &train.targets);
+        let judge = WindowMoments::gather(&validation.series, &validation.windows, &validation.targets);
+        let spectrum = Spectrum::new(&moments)?;
+        let linear = spectrum.best_map(&moments, &judge);
+        let skip = structure.linear_skip.then_some(&linear);
+        let wanted_scale = wanted_scale(&moments, skip);
+        for part in [&mut train, &mut validation] {
+            part.wanted = wanted(part, steps, skip, &wanted_scale);
+        }
+
+        let whitening = if published { Whitening::default() } else { whitening(&spectrum, &moments) };
+        let window_values = steps * spec.inputs.len();
+        let first_inputs = if published { window_values } else { whitening.components() };
+        let layers = structure.layers(first_inputs, spec.targets.len());
+        let recipe = recipe(&spec, published, data.train.runs.len(), train.windows.len());
+        let parameters = initial_parameters(&layers, spec.seed, 1.0);
+        Ok(Self {
+            spec,
+            structure,
+            steps,
+            input_scaling,
+            target_scaling,
+            train,
+            validation,
+            moments,
+            spectrum,
+            linear,
+            wanted_scale,
+            whitening,
+            layers,
+            parameters,
+            recipe,
+        })
+    }
+}
+
+fn with_defaults(data: &TrainingData, spec: &TrainingSpec) -> TrainingSpec {
+    let mut spec = spec.clone();
+    if spec.inputs.is_empty() {
+        spec.inputs = default_inputs(&data.train.channels);
+    }
+    if spec.targets.is_empty() {
+        spec.targets = default_targets(&data.train.channels);
+    }
+    spec
+}
+
+fn check_names(spec: &TrainingSpec) -> Result<(), TrainError> {
+    if spec.inputs.is_empty() {
+        return Err(TrainError::NoChannels { what: "input" });
+    }
+    if spec.targets.is_empty() {
+        return Err(TrainError::NoChannels { what: "target" });
+    }
+    if let Some(name) = spec.targets.iter().find(|t| spec.inputs.contains(t)) {
+        return Err(TrainError::TargetIsInput { name: name.clone() });
+    }
+    for (what, value) in [("learning_rate", spec.learning_rate), ("time_limit_s", spec.time_limit_s)] {
+        if let Some(value) = value.filter(|v| !(v.is_finite() && *v > 0.0)) {
+            return Err(TrainError::NotPositive { what, value });
+        }
+    }
+    for (what, value) in [("epochs", spec.epochs), ("batch", spec.batch)] {
+        if value == Some(0) {
+            return Err(TrainError::NotPositive { what, value: 0.0 });
+        }
+    }
+    Ok(())
+}
+
+fn check_lengths(runs: &Runs, steps: usize, windows: &Windows) -> Result<(), TrainError> {
+    if !windows.is_empty() {
+        return Ok(());
+    }
+    let longest = runs.runs.iter().map(crate::runs::RunSamples::len).max().unwrap_or(0);
+    Err(TrainError::Window(WindowError::LongerThanRun {
+        steps,
+        window_s: steps as f64 * runs.sample_time_s,
+        longest,
+        longest_s: longest as f64 * runs.sample_time_s,
+    }))
+}
+
+fn target_rows(runs: &Runs, scaling: &Scaling) -> TargetRows {
+    let width = runs.channels.len();
+    let rows: usize = runs.runs.iter().map(crate::runs::RunSamples::len).sum();
+    let mut values = Vec::with_capacity(rows * width);
+    for run in &runs.runs {
+        for row in 0..run.len() {
+            values.extend(run.columns.iter().enumerate().map(|(t, column)| scaling.scale(t, column[row])));
+        }
+    }
+    TargetRows { width, values }
+}
+
+/// Standard deviation of the linear map's error on the training windows; 1 without skip. A target
+/// that the map explains to the last bit keeps a floor far below anything measurable.
+fn wanted_scale(moments: &WindowMoments, skip: Option<&LinearMap>) -> Vec<f64> {
+    const FLOOR: f64 = 1e-7;
+    skip.map_or_else(
+        || vec![1.0; moments.target_mean.len()],
+        |map| moments.mean_squared_error(map).iter().map(|mse| mse.sqrt().max(FLOOR)).collect(),
+    )
+}
+
+fn wanted(part: &Part, steps: usize, skip: Option<&LinearMap>, scale: &[f64]) -> Vec<f32> {
+    let width = part.targets.width;
+    let mut wanted = vec![0.0_f32; part.targets.values.len()];
+    let mut linear = vec![0.0; width];
+    for index in 0..part.windows.len() {
+        let first = part.windows.first_row(index);
+        let row = first + steps - 1;
+        if let Some(map) = skip {
+            map.apply(part.series.window(first, steps), &mut linear);
+        }
+        for t in 0..width {
+            #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+            {
+                wanted[row * width + t] = ((part.targets.row(row)[t] - linear[t]) / scale[t]) as f32;
+            }
+        }
+    }
+    wanted
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+fn whitening(spectrum: &Spectrum, moments: &WindowMoments) -> Whitening {
+    let rows = spectrum.whitening(WHITENING_CUT, WHITENING_FLOOR);
+    let offset = rows
+        .iter()
+        .map(|row| -row.iter().zip(&moments.mean).map(|(p, m)| p * m).sum::<f64>() as f32)
+        .collect();
+    Whitening { projection: rows.iter().flatten().map(|&v| v as f32).collect(), offset }
+}
+
+fn recipe(spec: &TrainingSpec, published: bool, runs: usize, windows: usize) -> Recipe {
+    let batch = spec.batch.unwrap_or(if published { (runs / 8).max(1) } else { BATCH }).min(windows);
+    let steps_per_epoch = windows.div_ceil(batch);
+    let epochs = match (spec.epochs, spec.time_limit_s, published) {
+        (Some(epochs), ..) => epochs,
+        (None, Some(_), _) => usize::MAX,
+        (None, None, true) => PAPER_EPOCHS,
+        (None, None, false) => DEFAULT_STEPS.div_ceil(steps_per_epoch),
+    };
+    Recipe {
+        epochs,
+        time_limit_s: spec.time_limit_s,
+        learning_rate: spec.learning_rate.unwrap_or(if published { PAPER_LEARNING_RATE } else { LEARNING_RATE }),
+        cosine: !published,
+        batch,
+        loss_threshold: published.then_some(PAPER_LOSS_THRESHOLD),
+        seed: spec.seed,
+    }
+}
