@@ -17,9 +17,9 @@
 //! whitens the windows for the network (see [`Spectrum::whitening`]).
 
 use crate::window::{Series, Windows};
+use faer::diag::Diag;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};
-use faer::diag::Diag;
 use faer::{Mat, Par};
 
 /// Scaled targets in f64, row by row as the [`Series`] they belong to.
@@ -102,9 +102,19 @@ impl WindowMoments {
                 cross[(i, t)] = cross[(i, t)] / count - mean[i] * target_mean[t];
             }
         }
-        let target_variance =
-            target_square.iter().zip(&target_mean).map(|(s, m)| (s / count - m * m).max(0.0)).collect();
-        Self { count, mean, covariance: second, cross, target_mean, target_variance }
+        let target_variance = target_square
+            .iter()
+            .zip(&target_mean)
+            .map(|(s, m)| (s / count - m * m).max(0.0))
+            .collect();
+        Self {
+            count,
+            mean,
+            covariance: second,
+            cross,
+            target_mean,
+            target_variance,
+        }
     }
 
     /// Mean squared error of `map` for each target on these windows.
@@ -142,7 +152,12 @@ fn hankel_second_moment(series: &Series, windows: &Windows) -> Mat<f64> {
     let mut rows: Vec<f64> = Vec::new();
     for (first, count) in windows.spans() {
         rows.clear();
-        rows.extend(series.window(first, count + steps - 1).iter().map(|&x| f64::from(x)));
+        rows.extend(
+            series
+                .window(first, count + steps - 1)
+                .iter()
+                .map(|&x| f64::from(x)),
+        );
         // The first c columns of this run's sum, kept apart: the recursion needs them per run
         // only through their sum, so they go straight into `s`.
         for w in 0..count {
@@ -163,7 +178,11 @@ fn hankel_second_moment(series: &Series, windows: &Windows) -> Mat<f64> {
             let mut next: Vec<f64> = (0..length)
                 .map(|k| {
                     let (i, column) = (a * c + k, a * c + j);
-                    if i >= column { s[(i, column)] } else { s[(column, i)] }
+                    if i >= column {
+                        s[(i, column)]
+                    } else {
+                        s[(column, i)]
+                    }
                 })
                 .collect();
             for (first, count) in windows.spans() {
@@ -220,7 +239,13 @@ impl LinearMap {
     /// Applies the map to a scaled window.
     pub fn apply(&self, window: &[f32], out: &mut [f64]) {
         for (t, slot) in out.iter_mut().enumerate() {
-            *slot = self.bias[t] + self.row(t).iter().zip(window).map(|(w, &x)| w * f64::from(x)).sum::<f64>();
+            *slot = self.bias[t]
+                + self
+                    .row(t)
+                    .iter()
+                    .zip(window)
+                    .map(|(w, &x)| w * f64::from(x))
+                    .sum::<f64>();
         }
     }
 }
@@ -252,7 +277,8 @@ impl Spectrum {
         let size = moments.mean.len();
         let mut vectors = Mat::<f64>::zeros(size, size);
         let mut values = Diag::<f64>::zeros(size);
-        let scratch = self_adjoint_evd_scratch::<f64>(size, ComputeEigenvectors::Yes, Par::Seq, Default::default());
+        let scratch =
+            self_adjoint_evd_scratch::<f64>(size, ComputeEigenvectors::Yes, Par::Seq, Default::default());
         self_adjoint_evd(
             moments.covariance.as_ref(),
             values.as_mut(),
@@ -262,7 +288,10 @@ impl Spectrum {
             Default::default(),
         )
         .map_err(|_| SpectrumError)?;
-        Ok(Self { values: (0..size).map(|i| values[i]).collect(), vectors })
+        Ok(Self {
+            values: (0..size).map(|i| values[i]).collect(),
+            vectors,
+        })
     }
 
     fn largest(&self) -> f64 {
@@ -338,7 +367,11 @@ mod tests {
             values.push((f64::from(row) * 0.3).sin() as f32);
             values.push(f32::from((state >> 16) as u16) / 65536.0 - 0.3);
         }
-        Series { width: 2, values, run_rows }
+        Series {
+            width: 2,
+            values,
+            run_rows,
+        }
     }
 
     #[test]
@@ -363,7 +396,12 @@ mod tests {
         let mut values = vec![0.0; 40];
         for w in 0..windows.len() {
             let window = series.window(windows.first_row(w), 3);
-            values[windows.last_row(w)] = 3.0 + truth.iter().zip(window).map(|(a, &b)| a * f64::from(b)).sum::<f64>();
+            values[windows.last_row(w)] = 3.0
+                + truth
+                    .iter()
+                    .zip(window)
+                    .map(|(a, &b)| a * f64::from(b))
+                    .sum::<f64>();
         }
         let targets = TargetRows { width: 1, values };
         let moments = WindowMoments::gather(&series, &windows, &targets);
@@ -373,7 +411,11 @@ mod tests {
             map.apply(series.window(windows.first_row(w), 3), &mut estimate);
             let expected = targets.row(windows.last_row(w))[0];
             // The smallest ridge tried is 1e-13; a sine and its shifts are collinear up to 1e-2.
-            assert!((estimate[0] - expected).abs() < 1e-6, "{} {expected}", estimate[0]);
+            assert!(
+                (estimate[0] - expected).abs() < 1e-6,
+                "{} {expected}",
+                estimate[0]
+            );
         }
         let mse = moments.mean_squared_error(&map)[0];
         assert!(mse < 1e-12, "{mse}");
@@ -383,14 +425,22 @@ mod tests {
     fn whitened_windows_have_unit_variance() {
         let series = series();
         let windows = Windows::new(&series.run_rows, 3, WindowCut::Overlapping);
-        let targets = TargetRows { width: 1, values: vec![0.0; 40] };
+        let targets = TargetRows {
+            width: 1,
+            values: vec![0.0; 40],
+        };
         let moments = WindowMoments::gather(&series, &windows, &targets);
         let rows = Spectrum::new(&moments).unwrap().whitening(1e-9, 0.0);
         for row in &rows {
             let mut sum = 0.0;
             for w in 0..windows.len() {
                 let window = series.window(windows.first_row(w), 3);
-                let z: f64 = row.iter().zip(window).zip(&moments.mean).map(|((a, &x), m)| a * (f64::from(x) - m)).sum();
+                let z: f64 = row
+                    .iter()
+                    .zip(window)
+                    .zip(&moments.mean)
+                    .map(|((a, &x), m)| a * (f64::from(x) - m))
+                    .sum();
                 sum += z * z;
             }
             // Small eigenvalues carry the rounding of the covariance, 1e-16 over 1e-9.

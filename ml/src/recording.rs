@@ -4,7 +4,9 @@
 //! within each run; other columns are left alone.
 
 use crate::runs::{RunSamples, Runs, RunsError};
-use arrow::array::{Array, ArrayRef, AsArray, BooleanArray, Float64Array, RecordBatch, UInt32Array, UInt64Array};
+use arrow::array::{
+    Array, ArrayRef, AsArray, BooleanArray, Float64Array, RecordBatch, UInt32Array, UInt64Array,
+};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Schema, UInt64Type};
 use arrow::error::ArrowError;
@@ -93,9 +95,20 @@ pub enum RecordingError {
 ///
 /// # Errors
 /// The file is not readable, lacks a column, has an empty cell or unsorted steps.
-pub fn read_parquet(path: &Path, names: &[String], default_sample_time_s: f64) -> Result<Runs, RecordingError> {
-    let parquet_error = |source| RecordingError::Parquet { path: path.to_owned(), source };
-    let file = File::open(path).map_err(|source| RecordingError::File { action: "open", path: path.to_owned(), source })?;
+pub fn read_parquet(
+    path: &Path,
+    names: &[String],
+    default_sample_time_s: f64,
+) -> Result<Runs, RecordingError> {
+    let parquet_error = |source| RecordingError::Parquet {
+        path: path.to_owned(),
+        source,
+    };
+    let file = File::open(path).map_err(|source| RecordingError::File {
+        action: "open",
+        path: path.to_owned(),
+        source,
+    })?;
     let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(parquet_error)?;
     let schema = Arc::clone(builder.schema());
     for name in names.iter().map(String::as_str).chain(["run_id", "step"]) {
@@ -122,21 +135,41 @@ pub fn read_parquet(path: &Path, names: &[String], default_sample_time_s: f64) -
         let batch = batch.map_err(|source| parquet_error(ParquetError::ArrowError(source.to_string())))?;
         let ids = integers(path, &batch, "run_id")?;
         let steps = integers(path, &batch, "step")?;
-        let columns = names.iter().map(|name| floats(path, &batch, name)).collect::<Result<Vec<_>, _>>()?;
-        let times = if batch.column_by_name("time_s").is_some() { Some(floats(path, &batch, "time_s")?) } else { None };
+        let columns = names
+            .iter()
+            .map(|name| floats(path, &batch, name))
+            .collect::<Result<Vec<_>, _>>()?;
+        let times = if batch.column_by_name("time_s").is_some() {
+            Some(floats(path, &batch, "time_s")?)
+        } else {
+            None
+        };
         for row in 0..batch.num_rows() {
             let (run_id, step) = (ids.value(row), steps.value(row));
             if runs.last().is_none_or(|run| run.run_id != run_id) {
-                runs.push(RunSamples { run_id, columns: vec![Vec::new(); names.len()] });
+                runs.push(RunSamples {
+                    run_id,
+                    columns: vec![Vec::new(); names.len()],
+                });
             }
             let Some(run) = runs.last_mut() else { continue };
             let expected = run.len() as u64;
             if step != expected {
-                return Err(RecordingError::Order { path: path.to_owned(), run_id, expected, found: step });
+                return Err(RecordingError::Order {
+                    path: path.to_owned(),
+                    run_id,
+                    expected,
+                    found: step,
+                });
             }
             for ((column, values), name) in run.columns.iter_mut().zip(&columns).zip(names) {
                 if values.is_null(row) {
-                    return Err(RecordingError::Missing { path: path.to_owned(), run_id, step, column: name.clone() });
+                    return Err(RecordingError::Missing {
+                        path: path.to_owned(),
+                        run_id,
+                        step,
+                        column: name.clone(),
+                    });
                 }
                 column.push(values.value(row));
             }
@@ -159,25 +192,48 @@ pub fn read_parquet(path: &Path, names: &[String], default_sample_time_s: f64) -
             role: ChannelRole::Sensor,
         })
         .collect();
-    Ok(Runs { channels, sample_time_s: sample_time_s.unwrap_or(default_sample_time_s), runs })
+    Ok(Runs {
+        channels,
+        sample_time_s: sample_time_s.unwrap_or(default_sample_time_s),
+        runs,
+    })
 }
 
 fn field_metadata(schema: &Schema, name: &str, key: &str) -> String {
-    schema.field_with_name(name).ok().and_then(|f| f.metadata().get(key).cloned()).unwrap_or_default()
+    schema
+        .field_with_name(name)
+        .ok()
+        .and_then(|f| f.metadata().get(key).cloned())
+        .unwrap_or_default()
 }
 
-fn as_type(path: &Path, batch: &RecordBatch, name: &str, data_type: &DataType) -> Result<ArrayRef, RecordingError> {
-    let error = |source| RecordingError::Column { path: path.to_owned(), column: name.to_owned(), source };
-    let column = batch.column_by_name(name).ok_or_else(|| error(ArrowError::SchemaError("no such column".to_owned())))?;
+fn as_type(
+    path: &Path,
+    batch: &RecordBatch,
+    name: &str,
+    data_type: &DataType,
+) -> Result<ArrayRef, RecordingError> {
+    let error = |source| RecordingError::Column {
+        path: path.to_owned(),
+        column: name.to_owned(),
+        source,
+    };
+    let column = batch
+        .column_by_name(name)
+        .ok_or_else(|| error(ArrowError::SchemaError("no such column".to_owned())))?;
     cast(column, data_type).map_err(error)
 }
 
 fn integers(path: &Path, batch: &RecordBatch, name: &str) -> Result<UInt64Array, RecordingError> {
-    Ok(as_type(path, batch, name, &DataType::UInt64)?.as_primitive::<UInt64Type>().clone())
+    Ok(as_type(path, batch, name, &DataType::UInt64)?
+        .as_primitive::<UInt64Type>()
+        .clone())
 }
 
 fn floats(path: &Path, batch: &RecordBatch, name: &str) -> Result<Float64Array, RecordingError> {
-    Ok(as_type(path, batch, name, &DataType::Float64)?.as_primitive::<Float64Type>().clone())
+    Ok(as_type(path, batch, name, &DataType::Float64)?
+        .as_primitive::<Float64Type>()
+        .clone())
 }
 
 /// One target's estimates in a [`PredictionTable`].
@@ -209,8 +265,14 @@ pub struct PredictionTable {
 /// # Errors
 /// The file cannot be written.
 pub fn write_predictions(path: &Path, table: &PredictionTable) -> Result<(), RecordingError> {
-    let parquet_error = |source| RecordingError::Parquet { path: path.to_owned(), source };
-    let mut fields = vec![Field::new("run_id", DataType::UInt64, false), Field::new("step", DataType::UInt32, false)];
+    let parquet_error = |source| RecordingError::Parquet {
+        path: path.to_owned(),
+        source,
+    };
+    let mut fields = vec![
+        Field::new("run_id", DataType::UInt64, false),
+        Field::new("step", DataType::UInt32, false),
+    ];
     let mut columns: Vec<ArrayRef> = vec![
         Arc::new(UInt64Array::from(table.run_id.clone())),
         Arc::new(UInt32Array::from(table.step.clone())),
@@ -220,7 +282,11 @@ pub fn write_predictions(path: &Path, table: &PredictionTable) -> Result<(), Rec
         columns.push(Arc::new(Float64Array::from(target.values.clone())));
         if let Some((lower, upper)) = &target.bounds {
             for (suffix, values) in [("lower", lower), ("upper", upper)] {
-                fields.push(Field::new(format!("{}_{suffix}", target.name), DataType::Float64, true));
+                fields.push(Field::new(
+                    format!("{}_{suffix}", target.name),
+                    DataType::Float64,
+                    true,
+                ));
                 columns.push(Arc::new(Float64Array::from(values.clone())));
             }
         }
@@ -232,10 +298,14 @@ pub fn write_predictions(path: &Path, table: &PredictionTable) -> Result<(), Rec
     let schema = Arc::new(Schema::new(fields));
     let batch = RecordBatch::try_new(Arc::clone(&schema), columns)
         .map_err(|source| parquet_error(ParquetError::ArrowError(source.to_string())))?;
-    let file = File::create(path)
-        .map_err(|source| RecordingError::File { action: "create", path: path.to_owned(), source })?;
-    let properties =
-        WriterProperties::builder().set_compression(Compression::ZSTD(ZstdLevel::default())).build();
+    let file = File::create(path).map_err(|source| RecordingError::File {
+        action: "create",
+        path: path.to_owned(),
+        source,
+    })?;
+    let properties = WriterProperties::builder()
+        .set_compression(Compression::ZSTD(ZstdLevel::default()))
+        .build();
     let mut writer = ArrowWriter::try_new(file, schema, Some(properties)).map_err(parquet_error)?;
     writer.write(&batch).map_err(parquet_error)?;
     writer.close().map_err(parquet_error)?;

@@ -86,14 +86,20 @@ impl Runs {
     /// # Errors
     /// A name that is not there, or is given twice.
     pub fn positions(&self, names: &[String]) -> Result<Vec<usize>, RunsError> {
-        let by_name: HashMap<&str, usize> =
-            self.channels.iter().enumerate().map(|(i, c)| (c.name.as_str(), i)).collect();
+        let by_name: HashMap<&str, usize> = self
+            .channels
+            .iter()
+            .enumerate()
+            .map(|(i, c)| (c.name.as_str(), i))
+            .collect();
         let mut positions = Vec::with_capacity(names.len());
         for name in names {
-            let position = *by_name.get(name.as_str()).ok_or_else(|| RunsError::MissingChannel {
-                name: name.clone(),
-                available: self.channels.iter().map(|c| c.name.clone()).collect(),
-            })?;
+            let position = *by_name
+                .get(name.as_str())
+                .ok_or_else(|| RunsError::MissingChannel {
+                    name: name.clone(),
+                    available: self.channels.iter().map(|c| c.name.clone()).collect(),
+                })?;
             if positions.contains(&position) {
                 return Err(RunsError::DuplicateChannel { name: name.clone() });
             }
@@ -168,7 +174,10 @@ mod tests {
         Runs {
             channels: vec![channel("a"), channel("b")],
             sample_time_s: 0.005,
-            runs: vec![RunSamples { run_id: 7, columns: vec![vec![1.0, 2.0], vec![3.0, 4.0]] }],
+            runs: vec![RunSamples {
+                run_id: 7,
+                columns: vec![vec![1.0, 2.0], vec![3.0, 4.0]],
+            }],
         }
     }
 
@@ -189,6 +198,9 @@ mod tests {
         let mut bad = runs();
         bad.runs[0].columns[1][1] = f64::NAN;
         let error = bad.check().unwrap_err();
-        assert_eq!(error.to_string(), "run 7, step 1, channel \"b\": the value is NaN");
+        assert_eq!(
+            error.to_string(),
+            "run 7, step 1, channel \"b\": the value is NaN"
+        );
     }
 }

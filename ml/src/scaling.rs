@@ -24,7 +24,9 @@ impl Scaling {
     /// From a stored configuration.
     #[must_use]
     pub fn from_config(channels: &[ScaledChannel]) -> Self {
-        Self { channels: channels.to_vec() }
+        Self {
+            channels: channels.to_vec(),
+        }
     }
 
     /// Zero mean and unit variance over all rows of `runs`; a constant channel keeps its size.
@@ -35,7 +37,8 @@ impl Scaling {
             .iter()
             .enumerate()
             .map(|(i, channel)| {
-                let (mean, std) = mean_and_std(runs.runs.iter().flat_map(|run| run.columns[i].iter().copied()));
+                let (mean, std) =
+                    mean_and_std(runs.runs.iter().flat_map(|run| run.columns[i].iter().copied()));
                 let constant = std <= CONSTANT_RELATIVE * mean.abs().max(f64::MIN_POSITIVE);
                 scaled(channel, mean, if constant { 1.0 } else { std })
             })
@@ -64,7 +67,11 @@ impl Scaling {
                 } else if name.starts_with("valve_") {
                     1.0
                 } else {
-                    let largest = runs.runs.iter().flat_map(|run| run.columns[i].iter()).fold(0.0, |m: f64, v| m.max(v.abs()));
+                    let largest = runs
+                        .runs
+                        .iter()
+                        .flat_map(|run| run.columns[i].iter())
+                        .fold(0.0, |m: f64, v| m.max(v.abs()));
                     if largest > 0.0 { largest } else { 1.0 }
                 };
                 scaled(channel, 0.0, scale)
@@ -117,7 +124,12 @@ impl Scaling {
 }
 
 fn scaled(channel: &Channel, offset: f64, scale: f64) -> ScaledChannel {
-    ScaledChannel { name: channel.name.clone(), unit: channel.unit.clone(), offset, scale }
+    ScaledChannel {
+        name: channel.name.clone(),
+        unit: channel.unit.clone(),
+        offset,
+        scale,
+    }
 }
 
 /// Mean and standard deviation by Welford's update, stable for large offsets.
@@ -129,7 +141,11 @@ fn mean_and_std(values: impl Iterator<Item = f64>) -> (f64, f64) {
         mean += delta / count;
         squares += delta * (value - mean);
     }
-    if count == 0.0 { (0.0, 1.0) } else { (mean, (squares / count).sqrt()) }
+    if count == 0.0 {
+        (0.0, 1.0)
+    } else {
+        (mean, (squares / count).sqrt())
+    }
 }
 
 #[cfg(test)]
@@ -149,7 +165,10 @@ mod tests {
         Runs {
             channels: vec![channel("pressure_lift_piston_pa"), channel("angle_lift_rad")],
             sample_time_s: 0.005,
-            runs: vec![RunSamples { run_id: 0, columns: vec![vec![1e7, 1.2e7], vec![0.5, 0.5]] }],
+            runs: vec![RunSamples {
+                run_id: 0,
+                columns: vec![vec![1e7, 1.2e7], vec![0.5, 0.5]],
+            }],
         }
     }
 
@@ -158,7 +177,10 @@ mod tests {
         let scaling = Scaling::fit(&runs());
         assert!((scaling.scale(0, 1e7) + 1.0).abs() < 1e-12);
         assert!((scaling.unscale(0, 1.0) - 1.2e7).abs() < 1e-3);
-        assert!(scaling.scale(1, 0.5).abs() < 1e-15, "a constant channel scales to zero");
+        assert!(
+            scaling.scale(1, 0.5).abs() < 1e-15,
+            "a constant channel scales to zero"
+        );
     }
 
     #[test]

@@ -61,7 +61,11 @@ impl Structure {
                 .iter()
                 .map(|&w| ((w * widest).div_ceil(BEST_WIDTHS[0]), vec![Activation::Silu]))
                 .collect();
-            return Ok(Self { name: name.to_owned(), linear_skip: true, hidden });
+            return Ok(Self {
+                name: name.to_owned(),
+                linear_skip: true,
+                hidden,
+            });
         }
         let width = width.unwrap_or(window_steps);
         let mut hidden: Vec<(usize, Vec<Activation>)> = vec![(width, Vec::new())];
@@ -75,13 +79,22 @@ impl Structure {
                 'S' => Activation::Sigmoid,
                 'R' => Activation::Relu,
                 'E' => Activation::Elu,
-                letter => return Err(StructureError::UnknownLetter { name: name.to_owned(), letter }),
+                letter => {
+                    return Err(StructureError::UnknownLetter {
+                        name: name.to_owned(),
+                        letter,
+                    });
+                }
             };
             if let Some((_, activations)) = hidden.last_mut() {
                 activations.push(activation);
             }
         }
-        Ok(Self { name: name.to_owned(), linear_skip: false, hidden })
+        Ok(Self {
+            name: name.to_owned(),
+            linear_skip: false,
+            hidden,
+        })
     }
 
     /// Layers for a number of window values and targets. Names count linear maps and activations
@@ -114,7 +127,10 @@ impl Structure {
 /// Weights and biases of `layers`.
 #[must_use]
 pub fn parameter_count(layers: &[DenseLayer]) -> usize {
-    layers.iter().map(|layer| layer.outputs * (layer.inputs + 1)).sum()
+    layers
+        .iter()
+        .map(|layer| layer.outputs * (layer.inputs + 1))
+        .sum()
 }
 
 #[cfg(test)]
@@ -123,7 +139,10 @@ mod tests {
 
     fn shapes(name: &str) -> Vec<(usize, usize, usize)> {
         let layers = Structure::parse(name, 60, None).unwrap().layers(300, 1);
-        layers.iter().map(|l| (l.inputs, l.outputs, l.activations.len())).collect()
+        layers
+            .iter()
+            .map(|l| (l.inputs, l.outputs, l.activations.len()))
+            .collect()
     }
 
     #[test]

@@ -40,7 +40,11 @@ impl Series {
             first_row += run.len();
         }
         run_rows.push(first_row);
-        Self { width, values, run_rows }
+        Self {
+            width,
+            values,
+            run_rows,
+        }
     }
 
     /// Number of rows.
@@ -160,10 +164,17 @@ impl Windows {
 pub fn window_steps(window_s: f64, sample_time_s: f64) -> Result<usize, WindowError> {
     let steps = (window_s / sample_time_s).round();
     if !steps.is_finite() || steps < 1.0 {
-        return Err(WindowError::TooShort { window_s, sample_time_s });
+        return Err(WindowError::TooShort {
+            window_s,
+            sample_time_s,
+        });
     }
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "finite, at least 1, and \
-        saturates far beyond any run")]
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "finite, at least 1, and \
+        saturates far beyond any run"
+    )]
     Ok(steps as usize)
 }
 

@@ -32,7 +32,9 @@ fn oscillators(count: u64, first_id: u64) -> Runs {
         .map(|run_id| {
             let mut state = run_id.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             let mut random = || {
-                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
                 (state >> 40) as f64 / f64::from(1 << 23) - 1.0
             };
             let (mut x, mut v, mut u) = (random(), 0.0, 0.0);
@@ -50,11 +52,19 @@ fn oscillators(count: u64, first_id: u64) -> Runs {
             RunSamples { run_id, columns }
         })
         .collect();
-    Runs { channels, sample_time_s: 0.005, runs }
+    Runs {
+        channels,
+        sample_time_s: 0.005,
+        runs,
+    }
 }
 
 fn data() -> TrainingData {
-    TrainingData { train: oscillators(16, 0), validation: oscillators(4, 100), dataset_sha256: "0".repeat(64) }
+    TrainingData {
+        train: oscillators(16, 0),
+        validation: oscillators(4, 100),
+        dataset_sha256: "0".repeat(64),
+    }
 }
 
 fn spec(structure: &str, epochs: usize) -> TrainingSpec {
@@ -83,7 +93,12 @@ impl Folder {
         std::fs::read_dir(self.0.join(sub))
             .unwrap()
             .map(|entry| entry.unwrap().path())
-            .map(|path| (path.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(&path).unwrap()))
+            .map(|path| {
+                (
+                    path.file_name().unwrap().to_string_lossy().into_owned(),
+                    std::fs::read(&path).unwrap(),
+                )
+            })
             .collect()
     }
 }
@@ -98,8 +113,18 @@ fn go_on(_: Progress) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
-fn run(spec: &TrainingSpec, dir: &Path, name: &str) -> Result<hydroflex_openapi::model::ModelSummary, TrainError> {
-    train(&data(), spec, &mut go_on, &dir.join("checkpoint"), &dir.join(name))
+fn run(
+    spec: &TrainingSpec,
+    dir: &Path,
+    name: &str,
+) -> Result<hydroflex_openapi::model::ModelSummary, TrainError> {
+    train(
+        &data(),
+        spec,
+        &mut go_on,
+        &dir.join("checkpoint"),
+        &dir.join(name),
+    )
 }
 
 #[test]
@@ -107,22 +132,34 @@ fn our_network_beats_least_squares_and_its_folder_predicts_the_same() {
     let folder = Folder::new("best");
     let summary = run(&spec("best", 300), &folder.0, "model").unwrap();
     let (network, linear) = (summary.validation[0].mae, summary.validation_least_squares[0].mae);
-    assert!(network < 0.2 * linear, "network {network:e}, least squares {linear:e}");
+    assert!(
+        network < 0.2 * linear,
+        "network {network:e}, least squares {linear:e}"
+    );
 
     let model = Model::load(&folder.0.join("model")).unwrap();
     assert_eq!(model.sha256(), summary.model_sha256);
     let unseen = oscillators(5, 1000);
     let evaluation = hydroflex_ml::evaluate::evaluate(&model, &unseen, "").unwrap();
-    let (network, linear) = (&evaluation.report.targets[0], &evaluation.report.baselines[0].targets[0]);
-    assert!(network.mae < 0.3 * linear.mae, "unseen: {:e}, {:e}", network.mae, linear.mae);
+    let (network, linear) = (
+        &evaluation.report.targets[0],
+        &evaluation.report.baselines[0].targets[0],
+    );
+    assert!(
+        network.mae < 0.3 * linear.mae,
+        "unseen: {:e}, {:e}",
+        network.mae,
+        linear.mae
+    );
     assert_eq!(network.samples, 5 * 101, "120 samples have 101 windows of 20");
 
     // One by one, in a batch and along the series: three ways through the kernel.
     let predictor = model.predictor();
     let columns: Vec<&[f64]> = unseen.runs[0].columns[..2].iter().map(Vec::as_slice).collect();
     let series = predictor.predict_series(&columns);
-    let windows: Vec<f64> =
-        (0..101).flat_map(|w| (w..w + 20).flat_map(|r| [columns[0][r], columns[1][r]])).collect();
+    let windows: Vec<f64> = (0..101)
+        .flat_map(|w| (w..w + 20).flat_map(|r| [columns[0][r], columns[1][r]]))
+        .collect();
     let mut batch = vec![0.0; 101];
     let mut workspace = predictor.workspace();
     predictor.predict_windows(&windows, &mut batch, &mut workspace);
@@ -147,11 +184,19 @@ fn every_published_structure_trains() {
 #[test]
 fn the_published_recipe_uses_disjoint_windows_and_fixed_scales() {
     let folder = Folder::new("published");
-    let spec = TrainingSpec { windows: WindowCut::Disjoint, batch: None, ..spec("RLR", 40) };
+    let spec = TrainingSpec {
+        windows: WindowCut::Disjoint,
+        batch: None,
+        ..spec("RLR", 40)
+    };
     run(&spec, &folder.0, "model").unwrap();
     let model = Model::load(&folder.0.join("model")).unwrap();
     let config = model.config();
-    assert_eq!(config.provenance.train_windows, 16 * 6, "floor(120 / 20) windows per run");
+    assert_eq!(
+        config.provenance.train_windows,
+        16 * 6,
+        "floor(120 / 20) windows per run"
+    );
     assert_eq!(config.provenance.batch, 2, "an eighth of the runs");
     assert!((config.inputs[1].scale - 1.355).abs() < 1e-12);
 }
@@ -162,7 +207,11 @@ fn the_same_seed_gives_the_same_bytes_even_when_killed_and_resumed() {
     let spec = spec("best", 12);
     run(&spec, &folder.0, "whole").unwrap();
     let mut stop = |progress: Progress| {
-        if progress.epoch >= 5 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        if progress.epoch >= 5 {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     };
     let checkpoint = folder.0.join("checkpoint");
     let error = train(&data(), &spec, &mut stop, &checkpoint, &folder.0.join("resumed")).unwrap_err();
@@ -182,11 +231,19 @@ fn the_same_seed_gives_the_same_bytes_even_when_killed_and_resumed() {
 fn impossible_trainings_are_refused_with_the_reason() {
     let folder = Folder::new("refused");
     let message = |data: &TrainingData, spec: &TrainingSpec| {
-        train(data, spec, &mut go_on, &folder.0.join("c"), &folder.0.join("m")).unwrap_err().to_string()
+        train(data, spec, &mut go_on, &folder.0.join("c"), &folder.0.join("m"))
+            .unwrap_err()
+            .to_string()
     };
-    let missing = TrainingSpec { targets: vec!["strain_tip_xy".to_owned()], ..spec("best", 1) };
+    let missing = TrainingSpec {
+        targets: vec!["strain_tip_xy".to_owned()],
+        ..spec("best", 1)
+    };
     assert!(message(&data(), &missing).contains("strain_tip_xy"));
-    let long = TrainingSpec { window: WindowRule::Given { window_s: 2.0 }, ..spec("best", 1) };
+    let long = TrainingSpec {
+        window: WindowRule::Given { window_s: 2.0 },
+        ..spec("best", 1)
+    };
     assert!(message(&data(), &long).contains("longer than the longest run"));
     let mut few = data();
     few.train.runs.truncate(1);
@@ -194,7 +251,10 @@ fn impossible_trainings_are_refused_with_the_reason() {
     let mut broken = data();
     broken.train.runs[3].columns[1][7] = f64::NAN;
     assert!(message(&broken, &spec("best", 1)).contains("run 3, step 7"));
-    let wild = TrainingSpec { learning_rate: Some(1e6), ..spec("RLR", 20) };
+    let wild = TrainingSpec {
+        learning_rate: Some(1e6),
+        ..spec("RLR", 20)
+    };
     assert!(message(&data(), &wild).contains("diverged"));
     assert!(message(&data(), &spec("RXR", 1)).contains("'X'"));
 }
@@ -204,7 +264,9 @@ fn a_changed_file_is_not_loaded() {
     let folder = Folder::new("changed");
     run(&spec("L", 2), &folder.0, "model").unwrap();
     let path = folder.0.join("model/config.json");
-    let text = std::fs::read_to_string(&path).unwrap().replace("\"structure\": \"L\"", "\"structure\": \"T\"");
+    let text = std::fs::read_to_string(&path)
+        .unwrap()
+        .replace("\"structure\": \"L\"", "\"structure\": \"T\"");
     std::fs::write(&path, text).unwrap();
     let error = Model::load(&folder.0.join("model")).unwrap_err();
     assert!(error.to_string().contains("SHA256SUMS"), "{error}");

@@ -16,8 +16,11 @@ const SMALLEST_CLASS: usize = 60;
 /// Table for one target; absent when there are too few windows.
 #[must_use]
 pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalTable> {
-    let mut pairs: Vec<(f64, f64)> =
-        estimate.iter().zip(reference).map(|(e, r)| ((e - centre).abs(), (e - r).abs())).collect();
+    let mut pairs: Vec<(f64, f64)> = estimate
+        .iter()
+        .zip(reference)
+        .map(|(e, r)| ((e - centre).abs(), (e - r).abs()))
+        .collect();
     let classes = CLASSES.min(pairs.len() / SMALLEST_CLASS);
     if classes == 0 {
         return None;
@@ -34,7 +37,11 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
             upper_edges.push(pairs[to - 1].0);
         }
     }
-    Some(IntervalTable { centre, upper_edges, half_widths })
+    Some(IntervalTable {
+        centre,
+        upper_edges,
+        half_widths,
+    })
 }
 
 #[cfg(test)]
@@ -44,8 +51,11 @@ mod tests {
     #[test]
     fn errors_that_grow_get_wider_intervals_that_still_cover() {
         let reference: Vec<f64> = (0..6000).map(|i| (f64::from(i) * 0.7).sin() * 10.0).collect();
-        let estimate: Vec<f64> =
-            reference.iter().enumerate().map(|(i, r)| r * (1.0 + 0.01 * (i as f64 * 1.3).sin())).collect();
+        let estimate: Vec<f64> = reference
+            .iter()
+            .enumerate()
+            .map(|(i, r)| r * (1.0 + 0.01 * (i as f64 * 1.3).sin()))
+            .collect();
         let table = fit(&estimate, &reference, 0.0).unwrap();
         assert!(table.half_widths.windows(2).all(|w| w[0] < w[1]));
         let inside = estimate

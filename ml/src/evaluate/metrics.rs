@@ -12,9 +12,17 @@ use hydroflex_openapi::model::TargetMetrics;
 /// When the lengths differ.
 #[must_use]
 pub fn metrics(target: &str, unit: &str, estimate: &[f64], reference: &[f64]) -> TargetMetrics {
-    assert_eq!(estimate.len(), reference.len(), "one estimate per reference value");
+    assert_eq!(
+        estimate.len(),
+        reference.len(),
+        "one estimate per reference value"
+    );
     let count = reference.len().max(1) as f64;
-    let mut errors: Vec<f64> = estimate.iter().zip(reference).map(|(e, r)| (e - r).abs()).collect();
+    let mut errors: Vec<f64> = estimate
+        .iter()
+        .zip(reference)
+        .map(|(e, r)| (e - r).abs())
+        .collect();
     let mae = errors.iter().sum::<f64>() / count;
     let squares: f64 = errors.iter().map(|e| e * e).sum();
     let max = errors.iter().copied().fold(0.0, f64::max);
@@ -45,7 +53,11 @@ pub fn quantile(values: &mut [f64], q: f64) -> f64 {
         return 0.0;
     }
     values.sort_by(f64::total_cmp);
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and the length")]
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and the length"
+    )]
     let rank = (q * values.len() as f64).ceil().max(1.0) as usize;
     values[rank.min(values.len()) - 1]
 }

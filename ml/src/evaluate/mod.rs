@@ -65,7 +65,10 @@ pub struct Evaluation {
 pub fn check_sample_time(model: &Model, sample_time_s: f64) -> Result<(), EvaluateError> {
     let model_s = model.config().sample_time_s;
     if (sample_time_s - model_s).abs() > SAMPLE_TIME_TOLERANCE * model_s {
-        return Err(EvaluateError::SampleTime { model_s, data_s: sample_time_s });
+        return Err(EvaluateError::SampleTime {
+            model_s,
+            data_s: sample_time_s,
+        });
     }
     Ok(())
 }
@@ -88,7 +91,10 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
     let predictor = model.predictor();
     let mut workspace = predictor.workspace();
     let count = config.targets.len();
-    let scaling = (Scaling::from_config(&config.inputs), Scaling::from_config(&config.targets));
+    let scaling = (
+        Scaling::from_config(&config.inputs),
+        Scaling::from_config(&config.targets),
+    );
     let mut all = Columns::new(count);
     let (mut inside, mut windows) = (0_usize, 0_usize);
     let mut evaluated = Vec::new();
@@ -100,7 +106,13 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         let series = predictor.predict_series_with(&columns, &mut workspace);
         let first = series.first_row;
         let reference: Vec<Vec<f64>> = target.columns.iter().map(|c| c[first..].to_vec()).collect();
-        let least_squares = linear_series(&model.auxiliary().least_squares, &scaling, &columns, config.window_steps, first);
+        let least_squares = linear_series(
+            &model.auxiliary().least_squares,
+            &scaling,
+            &columns,
+            config.window_steps,
+            first,
+        );
         let quasi_static = linear_series(&model.auxiliary().quasi_static, &scaling, &columns, 1, first);
         inside += series.inside.iter().filter(|&&i| i).count();
         windows += reference[0].len();
@@ -112,14 +124,21 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         }
         evaluated.push(RunEvaluation {
             run_id: input.run_id,
-            time_s: (first..input.len()).map(|row| row as f64 * runs.sample_time_s).collect(),
+            time_s: (first..input.len())
+                .map(|row| row as f64 * runs.sample_time_s)
+                .collect(),
             reference,
             estimate: series.columns,
             least_squares,
         });
     }
     if evaluated.is_empty() {
-        let longest = inputs.runs.iter().map(crate::runs::RunSamples::len).max().unwrap_or(0);
+        let longest = inputs
+            .runs
+            .iter()
+            .map(crate::runs::RunSamples::len)
+            .max()
+            .unwrap_or(0);
         return Err(WindowError::LongerThanRun {
             steps: config.window_steps,
             window_s: config.window_s,
@@ -133,7 +152,9 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
             .targets
             .iter()
             .zip(estimate.iter().zip(&all.reference))
-            .map(|(channel, (estimate, reference))| metrics(&channel.name, &channel.unit, estimate, reference))
+            .map(|(channel, (estimate, reference))| {
+                metrics(&channel.name, &channel.unit, estimate, reference)
+            })
             .collect()
     };
     let mut of_model = judge(&all.estimate);
@@ -142,7 +163,11 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
             let covered = all.estimate[t]
                 .iter()
                 .zip(&all.reference[t])
-                .filter(|&(&e, &r)| predictor.half_width(t, e).is_some_and(|half| (e - r).abs() <= half))
+                .filter(|&(&e, &r)| {
+                    predictor
+                        .half_width(t, e)
+                        .is_some_and(|half| (e - r).abs() <= half)
+                })
                 .count();
             metrics.coverage = Some(covered as f64 / all.reference[t].len() as f64);
         }
@@ -153,12 +178,21 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         runs: evaluated.len(),
         targets: of_model,
         baselines: vec![
-            BaselineMetrics { name: "least_squares".to_owned(), targets: judge(&all.least_squares) },
-            BaselineMetrics { name: "quasi_static".to_owned(), targets: judge(&all.quasi_static) },
+            BaselineMetrics {
+                name: "least_squares".to_owned(),
+                targets: judge(&all.least_squares),
+            },
+            BaselineMetrics {
+                name: "quasi_static".to_owned(),
+                targets: judge(&all.quasi_static),
+            },
         ],
         inside_envelope: predictor.has_envelope().then(|| inside as f64 / windows as f64),
     };
-    Ok(Evaluation { report, runs: evaluated })
+    Ok(Evaluation {
+        report,
+        runs: evaluated,
+    })
 }
 
 struct Columns {
@@ -171,7 +205,12 @@ struct Columns {
 impl Columns {
     fn new(count: usize) -> Self {
         let empty = || vec![Vec::new(); count];
-        Self { reference: empty(), estimate: empty(), least_squares: empty(), quasi_static: empty() }
+        Self {
+            reference: empty(),
+            estimate: empty(),
+            least_squares: empty(),
+            quasi_static: empty(),
+        }
     }
 }
 
@@ -196,7 +235,11 @@ fn linear_series(
             (first..rows)
                 .map(|row| {
                     let window = &scaled[(row + 1 - steps) * width..(row + 1) * width];
-                    let sum: f64 = weights.iter().zip(window).map(|(&w, &x)| f64::from(w) * f64::from(x)).sum();
+                    let sum: f64 = weights
+                        .iter()
+                        .zip(window)
+                        .map(|(&w, &x)| f64::from(w) * f64::from(x))
+                        .sum();
                     targets.unscale(t, sum + f64::from(map.bias[t]))
                 })
                 .collect()

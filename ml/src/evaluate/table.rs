@@ -16,11 +16,20 @@ pub struct DisplayUnit {
 #[must_use]
 pub fn display_unit(target: &str) -> Option<DisplayUnit> {
     if target.starts_with("deflection_") {
-        Some(DisplayUnit { factor: 1e3, label: "mm" })
+        Some(DisplayUnit {
+            factor: 1e3,
+            label: "mm",
+        })
     } else if target.starts_with("strain_") {
-        Some(DisplayUnit { factor: 1e6, label: "µstrain" })
+        Some(DisplayUnit {
+            factor: 1e6,
+            label: "µstrain",
+        })
     } else if target.starts_with("stress_") {
-        Some(DisplayUnit { factor: 1e-6, label: "N/mm²" })
+        Some(DisplayUnit {
+            factor: 1e-6,
+            label: "N/mm²",
+        })
     } else {
         None
     }
@@ -39,9 +48,18 @@ pub struct PublishedError {
 /// The paper's boom, the paper's networks: another structure than the built-in boom, so these
 /// stand beside our errors for orientation only.
 pub const PUBLISHED: [PublishedError; 3] = [
-    PublishedError { payload_kg: 0.0, deflection_mae_mm: 0.024 },
-    PublishedError { payload_kg: 50.0, deflection_mae_mm: 0.070 },
-    PublishedError { payload_kg: 100.0, deflection_mae_mm: 0.112 },
+    PublishedError {
+        payload_kg: 0.0,
+        deflection_mae_mm: 0.024,
+    },
+    PublishedError {
+        payload_kg: 50.0,
+        deflection_mae_mm: 0.070,
+    },
+    PublishedError {
+        payload_kg: 100.0,
+        deflection_mae_mm: 0.112,
+    },
 ];
 
 /// Table of a report: one line per target and estimator, ending in a line break.
@@ -64,7 +82,11 @@ pub fn table(report: &EvaluationReport) -> String {
 
 fn title(target: &TargetMetrics) -> String {
     let unit = display_unit(&target.target).map_or(target.unit.as_str(), |u| u.label);
-    let name = target.target.strip_suffix("_m").or_else(|| target.target.strip_suffix("_pa")).unwrap_or(&target.target);
+    let name = target
+        .target
+        .strip_suffix("_m")
+        .or_else(|| target.target.strip_suffix("_pa"))
+        .unwrap_or(&target.target);
     format!("{name} [{unit}]")
 }
 
@@ -98,7 +120,11 @@ pub fn significant(value: f64) -> String {
     }
     let magnitude = value.abs().log10().floor();
     if (-6.0..6.0).contains(&magnitude) {
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and 8")]
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "between 0 and 8"
+        )]
         let decimals = (2.0 - magnitude).max(0.0) as usize;
         format!("{value:.decimals$}")
     } else {

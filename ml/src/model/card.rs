@@ -15,7 +15,10 @@ pub fn card(config: &ModelConfig) -> String {
 
 fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
     let provenance = &config.provenance;
-    writeln!(text, "---\nlibrary_name: hydroflex\ntags: [slide, hydraulics, flexible-multibody, virtual-sensor]\n---\n")?;
+    writeln!(
+        text,
+        "---\nlibrary_name: hydroflex\ntags: [slide, hydraulics, flexible-multibody, virtual-sensor]\n---\n"
+    )?;
     writeln!(text, "# SLIDE network `{}`\n", config.structure)?;
     writeln!(
         text,
@@ -28,10 +31,17 @@ fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
         config.inputs.len(),
         config.window_steps - 1,
     )?;
-    writeln!(text, "## Signals\n\n| | column | unit | offset | scale |\n|---|---|---|---|---|")?;
+    writeln!(
+        text,
+        "## Signals\n\n| | column | unit | offset | scale |\n|---|---|---|---|---|"
+    )?;
     for (role, channels) in [("in", &config.inputs), ("out", &config.targets)] {
         for c in channels {
-            writeln!(text, "| {role} | `{}` | {} | {:.6e} | {:.6e} |", c.name, c.unit, c.offset, c.scale)?;
+            writeln!(
+                text,
+                "| {role} | `{}` | {} | {:.6e} | {:.6e} |",
+                c.name, c.unit, c.offset, c.scale
+            )?;
         }
     }
     writeln!(
@@ -39,7 +49,10 @@ fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
         "\n`scaled = (value − offset) / scale`. A window is row-major: all signals of the oldest sample first.\n"
     )?;
     writeln!(text, "## Errors on the validation runs\n")?;
-    writeln!(text, "| target | estimator | MAE | RMSE | p95 | max | MAE / range | R² |\n|---|---|---|---|---|---|---|---|")?;
+    writeln!(
+        text,
+        "| target | estimator | MAE | RMSE | p95 | max | MAE / range | R² |\n|---|---|---|---|---|---|---|---|"
+    )?;
     for (network, linear) in config.validation.iter().zip(&config.validation_least_squares) {
         metrics_line(text, "network", network)?;
         metrics_line(text, "least squares", linear)?;
@@ -65,7 +78,11 @@ fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
         "- Adam from {:.1e}, batch {}, seed {}",
         provenance.learning_rate, provenance.batch, provenance.spec.seed
     )?;
-    writeln!(text, "- hydroflex {}, burn {}\n", provenance.hydroflex_version, provenance.burn_version)?;
+    writeln!(
+        text,
+        "- hydroflex {}, burn {}\n",
+        provenance.hydroflex_version, provenance.burn_version
+    )?;
     writeln!(text, "## Limits\n")?;
     writeln!(
         text,

@@ -173,12 +173,20 @@ impl Model {
         let mut workspace = self.predictor.workspace();
         let mut estimates = vec![0.0; self.config.targets.len()];
         for (index, golden) in self.config.golden.iter().enumerate() {
-            self.predictor.predict_window(&golden.window, &mut estimates, &mut workspace);
-            for ((target, &expected), &found) in self.config.targets.iter().zip(&golden.estimates).zip(&estimates) {
+            self.predictor
+                .predict_window(&golden.window, &mut estimates, &mut workspace);
+            for ((target, &expected), &found) in
+                self.config.targets.iter().zip(&golden.estimates).zip(&estimates)
+            {
                 // `!(a <= b)` also catches NaN.
                 #[allow(clippy::neg_cmp_op_on_partial_ord, reason = "NaN must fail")]
                 if !((found - expected).abs() <= GOLDEN_TOLERANCE * target.scale.abs()) {
-                    return Err(ModelError::Golden { index, target: target.name.clone(), expected, found });
+                    return Err(ModelError::Golden {
+                        index,
+                        target: target.name.clone(),
+                        expected,
+                        found,
+                    });
                 }
             }
         }
@@ -187,18 +195,34 @@ impl Model {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, ModelError> {
-    fs::read(path).map_err(|source| ModelError::File { action: "read", path: path.to_owned(), source })
+    fs::read(path).map_err(|source| ModelError::File {
+        action: "read",
+        path: path.to_owned(),
+        source,
+    })
 }
 
 fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
-    let config_error = |source| ModelError::Config { path: path.to_owned(), source };
+    let config_error = |source| ModelError::Config {
+        path: path.to_owned(),
+        source,
+    };
     let value: serde_json::Value = serde_json::from_slice(&read(path)?).map_err(config_error)?;
-    let found = value.get("format_version").and_then(serde_json::Value::as_u64).unwrap_or(0);
+    let found = value
+        .get("format_version")
+        .and_then(serde_json::Value::as_u64)
+        .unwrap_or(0);
     if found != u64::from(MODEL_FORMAT_VERSION) {
-        return Err(ModelError::Format { path: path.to_owned(), found: u32::try_from(found).unwrap_or(u32::MAX) });
+        return Err(ModelError::Format {
+            path: path.to_owned(),
+            found: u32::try_from(found).unwrap_or(u32::MAX),
+        });
     }
     let config: ModelConfig = serde_json::from_value(value).map_err(config_error)?;
-    let inconsistent = |what| ModelError::Inconsistent { path: path.to_owned(), what };
+    let inconsistent = |what| ModelError::Inconsistent {
+        path: path.to_owned(),
+        what,
+    };
     let window_values = config.window_steps * config.inputs.len();
     if window_values == 0 || config.targets.is_empty() {
         return Err(inconsistent("a model needs inputs, targets and a window"));
@@ -206,7 +230,9 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
     let mut width = window_values;
     for layer in &config.layers {
         if layer.inputs != width || layer.outputs == 0 {
-            return Err(inconsistent("a layer does not take what the layer before it gives"));
+            return Err(inconsistent(
+                "a layer does not take what the layer before it gives",
+            ));
         }
         width = layer.outputs;
     }
@@ -217,11 +243,20 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
         return Err(inconsistent("a model needs layers or a linear map"));
     }
     let scales = config.inputs.iter().chain(&config.targets);
-    if scales.clone().any(|c| !(c.scale.is_finite() && c.scale > 0.0 && c.offset.is_finite())) {
+    if scales
+        .clone()
+        .any(|c| !(c.scale.is_finite() && c.scale > 0.0 && c.offset.is_finite()))
+    {
         return Err(inconsistent("scales must be positive and finite"));
     }
-    if config.golden.iter().any(|g| g.window.len() != window_values || g.estimates.len() != config.targets.len()) {
-        return Err(inconsistent("a golden prediction has another shape than the model"));
+    if config
+        .golden
+        .iter()
+        .any(|g| g.window.len() != window_values || g.estimates.len() != config.targets.len())
+    {
+        return Err(inconsistent(
+            "a golden prediction has another shape than the model",
+        ));
     }
     Ok(config)
 }

@@ -55,8 +55,16 @@ struct Tensor<'a> {
 fn linear<'a>(prefix: &str, map: &'a LinearWeights) -> [Tensor<'a>; 2] {
     let outputs = map.bias.len();
     [
-        Tensor { name: format!("{prefix}.weight"), shape: vec![outputs, map.weight.len() / outputs.max(1)], values: &map.weight },
-        Tensor { name: format!("{prefix}.bias"), shape: vec![outputs], values: &map.bias },
+        Tensor {
+            name: format!("{prefix}.weight"),
+            shape: vec![outputs, map.weight.len() / outputs.max(1)],
+            values: &map.weight,
+        },
+        Tensor {
+            name: format!("{prefix}.bias"),
+            shape: vec![outputs],
+            values: &map.bias,
+        },
     ]
 }
 
@@ -65,7 +73,12 @@ fn to_file(tensors: &[Tensor<'_>]) -> Result<Vec<u8>, safetensors::SafeTensorErr
     let views = tensors
         .iter()
         .zip(&bytes)
-        .map(|(t, data)| Ok((t.name.as_str(), TensorView::new(Dtype::F32, t.shape.clone(), data)?)))
+        .map(|(t, data)| {
+            Ok((
+                t.name.as_str(),
+                TensorView::new(Dtype::F32, t.shape.clone(), data)?,
+            ))
+        })
         .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()?;
     serialize(views, None)
 }
@@ -77,8 +90,10 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     fn new(path: &'a Path, content: &'a [u8]) -> Result<Self, ModelError> {
-        let tensors = SafeTensors::deserialize(content)
-            .map_err(|source| ModelError::Tensors { path: path.to_owned(), source })?;
+        let tensors = SafeTensors::deserialize(content).map_err(|source| ModelError::Tensors {
+            path: path.to_owned(),
+            source,
+        })?;
         Ok(Self { path, tensors })
     }
 
@@ -109,8 +124,11 @@ impl Weights {
     /// # Errors
     /// A shape does not fit its values.
     pub fn to_file(&self, layers: &[DenseLayer]) -> Result<Vec<u8>, safetensors::SafeTensorError> {
-        let mut tensors: Vec<Tensor<'_>> =
-            layers.iter().zip(&self.layers).flat_map(|(layer, map)| linear(&layer.name, map)).collect();
+        let mut tensors: Vec<Tensor<'_>> = layers
+            .iter()
+            .zip(&self.layers)
+            .flat_map(|(layer, map)| linear(&layer.name, map))
+            .collect();
         if let Some(skip) = &self.skip {
             tensors.extend(linear("skip", skip));
         }
@@ -130,7 +148,10 @@ impl Weights {
             .map(|layer| reader.linear(&layer.name, layer.outputs, layer.inputs))
             .collect::<Result<_, _>>()?;
         let window_values = config.window_steps * config.inputs.len();
-        let skip = config.linear_skip.then(|| reader.linear("skip", config.targets.len(), window_values)).transpose()?;
+        let skip = config
+            .linear_skip
+            .then(|| reader.linear("skip", config.targets.len(), window_values))
+            .transpose()?;
         Ok(Self { layers, skip })
     }
 }

@@ -59,12 +59,18 @@ pub fn write_model(
     }
     config.golden = golden(problem, data, &predictor);
 
-    let tensors = |source| ModelError::Tensors { path: out_dir.to_owned(), source };
+    let tensors = |source| ModelError::Tensors {
+        path: out_dir.to_owned(),
+        source,
+    };
     let files = [
         ("README.md", card::card(&config).into_bytes()),
         ("auxiliary.safetensors", auxiliary.to_file().map_err(tensors)?),
         ("config.json", to_json(&config)),
-        ("model.safetensors", weights.to_file(&config.layers).map_err(tensors)?),
+        (
+            "model.safetensors",
+            weights.to_file(&config.layers).map_err(tensors)?,
+        ),
     ];
     write_folder(out_dir, &files)?;
     let model = Model::load(out_dir)?;
@@ -75,9 +81,16 @@ pub fn write_model(
 fn write_folder(out_dir: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), ModelError> {
     let file_error = |path: &Path| {
         let path = path.to_owned();
-        move |source| ModelError::File { action: "write", path, source }
+        move |source| ModelError::File {
+            action: "write",
+            path,
+            source,
+        }
     };
-    let name = out_dir.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let name = out_dir
+        .file_name()
+        .map(|n| n.to_string_lossy().into_owned())
+        .unwrap_or_default();
     let temporary = out_dir.with_file_name(format!(".{name}.part"));
     if temporary.exists() {
         fs::remove_dir_all(&temporary).map_err(file_error(&temporary))?;
@@ -110,7 +123,10 @@ fn to_json(config: &ModelConfig) -> Vec<u8> {
 
 /// Layers with their real input: the first one takes the scaled window itself.
 fn final_layers(problem: &Problem) -> Vec<DenseLayer> {
-    problem.structure.layers(problem.steps * problem.spec.inputs.len(), problem.spec.targets.len())
+    problem.structure.layers(
+        problem.steps * problem.spec.inputs.len(),
+        problem.spec.targets.len(),
+    )
 }
 
 /// Folds whitening into the first layer and the residual's scale into the last one, in f64.
@@ -124,7 +140,10 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
             let (weight, tail) = rest.split_at(layer.outputs * layer.inputs);
             let (bias, tail) = tail.split_at(layer.outputs);
             rest = tail;
-            LinearWeights { weight: weight.to_vec(), bias: bias.to_vec() }
+            LinearWeights {
+                weight: weight.to_vec(),
+                bias: bias.to_vec(),
+            }
         })
         .collect();
     let components = problem.whitening.components();
@@ -139,8 +158,11 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
                     *s += f64::from(w) * f64::from(p);
                 }
             }
-            let shift: f64 =
-                row.iter().zip(&problem.whitening.offset).map(|(&w, &o)| f64::from(w) * f64::from(o)).sum();
+            let shift: f64 = row
+                .iter()
+                .zip(&problem.whitening.offset)
+                .map(|(&w, &o)| f64::from(w) * f64::from(o))
+                .sum();
             *bias = (f64::from(*bias) + shift) as f32;
             weight.extend(sum.iter().map(|&s| s as f32));
         }
@@ -150,11 +172,19 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
         let inputs = last.weight.len() / last.bias.len();
         for (t, &scale) in problem.wanted_scale.iter().enumerate() {
             let scaled = |w: &mut f32| *w = (f64::from(*w) * scale) as f32;
-            last.weight[t * inputs..(t + 1) * inputs].iter_mut().for_each(scaled);
+            last.weight[t * inputs..(t + 1) * inputs]
+                .iter_mut()
+                .for_each(scaled);
             scaled(&mut last.bias[t]);
         }
     }
-    Weights { layers, skip: problem.structure.linear_skip.then(|| LinearWeights::from(&problem.linear)) }
+    Weights {
+        layers,
+        skip: problem
+            .structure
+            .linear_skip
+            .then(|| LinearWeights::from(&problem.linear)),
+    }
 }
 
 /// Least squares on single rows: what a static formula could do.
@@ -165,14 +195,28 @@ fn quasi_static(problem: &Problem) -> LinearWeights {
         let mut values = Vec::new();
         let mut targets = Vec::new();
         let mut run_rows = vec![0];
-        for (first, count) in Windows::new(&part.series.run_rows, problem.steps, WindowCut::Overlapping).spans() {
+        for (first, count) in
+            Windows::new(&part.series.run_rows, problem.steps, WindowCut::Overlapping).spans()
+        {
             let (from, to) = (first + problem.steps - 1, first + problem.steps - 1 + count);
             values.extend_from_slice(&part.series.values[from * width..to * width]);
-            targets.extend_from_slice(&part.targets.values[from * part.targets.width..to * part.targets.width]);
+            targets
+                .extend_from_slice(&part.targets.values[from * part.targets.width..to * part.targets.width]);
             run_rows.push(values.len() / width);
         }
         let windows = Windows::new(&run_rows, 1, WindowCut::Overlapping);
-        (Series { width, values, run_rows }, windows, TargetRows { width: part.targets.width, values: targets })
+        (
+            Series {
+                width,
+                values,
+                run_rows,
+            },
+            windows,
+            TargetRows {
+                width: part.targets.width,
+                values: targets,
+            },
+        )
     };
     let (series, windows, targets) = last_rows(&problem.train);
     let moments = WindowMoments::gather(&series, &windows, &targets);
@@ -190,24 +234,50 @@ fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights)
     let rows = problem.spectrum.whitening(ENVELOPE_CUT, 0.0);
     let bias = rows
         .iter()
-        .map(|row| -row.iter().zip(&problem.moments.mean).map(|(p, m)| p * m).sum::<f64>() as f32)
+        .map(|row| {
+            -row.iter()
+                .zip(&problem.moments.mean)
+                .map(|(p, m)| p * m)
+                .sum::<f64>() as f32
+        })
         .collect();
-    let projection = LinearWeights { weight: rows.iter().flatten().map(|&v| v as f32).collect(), bias };
+    let projection = LinearWeights {
+        weight: rows.iter().flatten().map(|&v| v as f32).collect(),
+        bias,
+    };
     let positions = data.train.positions(&problem.spec.inputs).unwrap_or_default();
     let (mut min, mut max) = (Vec::new(), Vec::new());
     for position in positions {
-        let values = || data.train.runs.iter().flat_map(move |run| run.columns[position].iter().copied());
-        let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
+        let values = || {
+            data.train
+                .runs
+                .iter()
+                .flat_map(move |run| run.columns[position].iter().copied())
+        };
+        let (low, high) = (
+            values().fold(f64::INFINITY, f64::min),
+            values().fold(f64::NEG_INFINITY, f64::max),
+        );
         let margin = ENVELOPE_MARGIN * (high - low);
         min.push(low - margin);
         max.push(high + margin);
     }
-    (Envelope { components: rows.len(), limit: 0.0, min, max }, projection)
+    (
+        Envelope {
+            components: rows.len(),
+            limit: 0.0,
+            min,
+            max,
+        },
+        projection,
+    )
 }
 
 /// Squared length per component that [`ENVELOPE_QUANTILE`] of the validation windows stay below.
 fn envelope_limit(problem: &Problem, auxiliary: &Auxiliary) -> f64 {
-    let Some(map) = &auxiliary.envelope else { return f64::MAX };
+    let Some(map) = &auxiliary.envelope else {
+        return f64::MAX;
+    };
     let projection = crate::predict::kernel::PackedLayer::new(map, &[]);
     let components = map.bias.len();
     let part = &problem.validation;
@@ -238,14 +308,19 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
     let mut row = vec![0.0; targets];
     for index in 0..part.windows.len() {
         let first = part.windows.first_row(index);
-        problem.linear.apply(part.series.window(first, problem.steps), &mut row);
+        problem
+            .linear
+            .apply(part.series.window(first, problem.steps), &mut row);
         for t in 0..targets {
             reference[t].push(scaling.unscale(t, part.targets.row(first + problem.steps - 1)[t]));
             linear[t].push(scaling.unscale(t, row[t]));
         }
     }
     let mut estimates = vec![Vec::new(); targets];
-    let positions = data.validation.positions(&problem.spec.inputs).unwrap_or_default();
+    let positions = data
+        .validation
+        .positions(&problem.spec.inputs)
+        .unwrap_or_default();
     let mut workspace = predictor.workspace();
     for run in &data.validation.runs {
         let columns: Vec<&[f64]> = positions.iter().map(|&p| run.columns[p].as_slice()).collect();
@@ -259,7 +334,9 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
             .channels()
             .iter()
             .zip(estimate.iter().zip(&reference))
-            .map(|(channel, (estimate, reference))| metrics(&channel.name, &channel.unit, estimate, reference))
+            .map(|(channel, (estimate, reference))| {
+                metrics(&channel.name, &channel.unit, estimate, reference)
+            })
             .collect()
     };
     let intervals = estimates
@@ -271,14 +348,26 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
     Judged {
         network: judge(&estimates),
         least_squares: judge(&linear),
-        intervals: if intervals.len() == targets { intervals } else { Vec::new() },
+        intervals: if intervals.len() == targets {
+            intervals
+        } else {
+            Vec::new()
+        },
     }
 }
 
 /// Windows spread over the validation runs.
 fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<GoldenPrediction> {
-    let positions = data.validation.positions(&problem.spec.inputs).unwrap_or_default();
-    let long: Vec<_> = data.validation.runs.iter().filter(|run| run.len() >= problem.steps).collect();
+    let positions = data
+        .validation
+        .positions(&problem.spec.inputs)
+        .unwrap_or_default();
+    let long: Vec<_> = data
+        .validation
+        .runs
+        .iter()
+        .filter(|run| run.len() >= problem.steps)
+        .collect();
     let mut workspace = predictor.workspace();
     (0..GOLDEN_WINDOWS)
         .filter_map(|i| {
@@ -332,7 +421,11 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
 
 fn summary(model: &Model, problem: &Problem, outcome: &Outcome) -> ModelSummary {
     let config = model.config();
-    let skip = if config.linear_skip { config.targets.len() * (config.window_steps * config.inputs.len() + 1) } else { 0 };
+    let skip = if config.linear_skip {
+        config.targets.len() * (config.window_steps * config.inputs.len() + 1)
+    } else {
+        0
+    };
     ModelSummary {
         model_sha256: model.sha256().to_owned(),
         dataset_sha256: config.provenance.dataset_sha256.clone(),

@@ -27,13 +27,16 @@ pub fn dense(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, activations: &[Ac
         activations.first().copied(),
     );
     // Letters in a row without an L between them: rare, so burn's own operations do.
-    activations.iter().skip(1).fold(Tensor::from_dispatch(output), |y, activation| match activation {
-        Activation::Tanh => y.tanh(),
-        Activation::Sigmoid => burn::tensor::activation::sigmoid(y),
-        Activation::Relu => burn::tensor::activation::relu(y),
-        Activation::Elu => burn::tensor::activation::elu(y, 1.0),
-        Activation::Silu => burn::tensor::activation::silu(y),
-    })
+    activations
+        .iter()
+        .skip(1)
+        .fold(Tensor::from_dispatch(output), |y, activation| match activation {
+            Activation::Tanh => y.tanh(),
+            Activation::Sigmoid => burn::tensor::activation::sigmoid(y),
+            Activation::Relu => burn::tensor::activation::relu(y),
+            Activation::Elu => burn::tensor::activation::elu(y, 1.0),
+            Activation::Silu => burn::tensor::activation::silu(y),
+        })
 }
 
 /// The layer as a backend operation.
@@ -81,7 +84,9 @@ impl DenseKernels for Flex {
                 *v += b;
             }
         }
-        let Some(activation) = activation else { return (z.clone(), z) };
+        let Some(activation) = activation else {
+            return (z.clone(), z);
+        };
         if elementwise::saves_input(activation) {
             let mut y = FlexTensor::empty(z.layout().shape().clone(), z.dtype());
             y.storage_mut::<f32>().copy_from_slice(z.storage());
@@ -93,7 +98,11 @@ impl DenseKernels for Flex {
         }
     }
 
-    fn dense_chain(saved: &FlexTensor, grad: FlexTensor, activation: Option<Activation>) -> (FlexTensor, FlexTensor) {
+    fn dense_chain(
+        saved: &FlexTensor,
+        grad: FlexTensor,
+        activation: Option<Activation>,
+    ) -> (FlexTensor, FlexTensor) {
         let mut grad = grad.to_contiguous();
         if let Some(activation) = activation {
             elementwise::chain(activation, saved.storage(), grad.storage_mut());
@@ -111,7 +120,12 @@ impl DenseKernels for Flex {
 }
 
 impl DenseOps for Flex {
-    fn dense(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, activation: Option<Activation>) -> FlexTensor {
+    fn dense(
+        x: FlexTensor,
+        weight: FlexTensor,
+        bias: FlexTensor,
+        activation: Option<Activation>,
+    ) -> FlexTensor {
         Self::dense_forward(x, weight, &bias, activation).0
     }
 }
@@ -134,7 +148,12 @@ impl<B: DenseKernels> Backward<B, 3> for DenseBackward {
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         let [x_node, weight_node, bias_node] = ops.parents;
-        let DenseState { x, weight, saved, activation } = ops.state;
+        let DenseState {
+            x,
+            weight,
+            saved,
+            activation,
+        } = ops.state;
         let grad = grads.consume::<B>(&ops.node);
         let (grad, bias_grad) = B::dense_chain(&saved, grad, activation);
         if let Some(node) = bias_node {
@@ -156,11 +175,22 @@ impl<B: DenseKernels, C: CheckpointStrategy> DenseOps for Autodiff<B, C> {
         bias: FloatTensor<Self>,
         activation: Option<Activation>,
     ) -> FloatTensor<Self> {
-        let prepared = DenseBackward.prepare::<C>([x.node(), weight.node(), bias.node()]).compute_bound().stateful();
+        let prepared = DenseBackward
+            .prepare::<C>([x.node(), weight.node(), bias.node()])
+            .compute_bound()
+            .stateful();
         let (x, weight) = (x.into_primitive(), weight.into_primitive());
         let (output, saved) = B::dense_forward(x.clone(), weight.clone(), bias.primitive(), activation);
         match prepared {
-            OpsKind::Tracked(prepared) => prepared.finish(DenseState { x, weight, saved, activation }, output),
+            OpsKind::Tracked(prepared) => prepared.finish(
+                DenseState {
+                    x,
+                    weight,
+                    saved,
+                    activation,
+                },
+                output,
+            ),
             OpsKind::UnTracked(prepared) => prepared.finish(output),
         }
     }
@@ -204,7 +234,11 @@ mod tests {
                     })
                     .collect();
             }
-            total += x.iter().zip(target).map(|(a, &b)| (a - f64::from(b)).powi(2)).sum::<f64>();
+            total += x
+                .iter()
+                .zip(target)
+                .map(|(a, &b)| (a - f64::from(b)).powi(2))
+                .sum::<f64>();
         }
         total / targets.len() as f64
     }
@@ -236,7 +270,11 @@ mod tests {
                 down[i] -= h;
                 let slope = (loss_of(&up) - loss_of(&down)) / (2.0 * h);
                 // f32 arithmetic on values of size one.
-                assert!((f64::from(gradient[i]) - slope).abs() < 2e-6, "{name} parameter {i}: {} {slope}", gradient[i]);
+                assert!(
+                    (f64::from(gradient[i]) - slope).abs() < 2e-6,
+                    "{name} parameter {i}: {} {slope}",
+                    gradient[i]
+                );
             }
         }
     }

@@ -46,7 +46,8 @@ pub fn tanh(x: f32) -> f32 {
     let large = 1.0 - 2.0 / (exp(2.0 * x.clamp(-20.0, 20.0)) + 1.0);
     let s = x * x;
     // x − x³/3 + 2x⁵/15 − 17x⁷/315 + 62x⁹/2835, next term below 2e-8 x for |x| < 0.3.
-    let small = x * (1.0 + s * (-0.333_333_34 + s * (0.133_333_34 + s * (-0.053_968_254 + s * 0.021_869_488))));
+    let small =
+        x * (1.0 + s * (-0.333_333_34 + s * (0.133_333_34 + s * (-0.053_968_254 + s * 0.021_869_488))));
     if s < 0.09 { small } else { large }
 }
 
@@ -150,15 +151,26 @@ vectorised!(
 mod tests {
     use super::*;
 
-    const ALL: [Activation; 5] =
-        [Activation::Tanh, Activation::Sigmoid, Activation::Relu, Activation::Elu, Activation::Silu];
+    const ALL: [Activation; 5] = [
+        Activation::Tanh,
+        Activation::Sigmoid,
+        Activation::Relu,
+        Activation::Elu,
+        Activation::Silu,
+    ];
 
     fn exact(activation: Activation, x: f64) -> f64 {
         match activation {
             Activation::Tanh => x.tanh(),
             Activation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
             Activation::Relu => x.max(0.0),
-            Activation::Elu => if x > 0.0 { x } else { x.exp_m1() },
+            Activation::Elu => {
+                if x > 0.0 {
+                    x
+                } else {
+                    x.exp_m1()
+                }
+            }
             Activation::Silu => x / (1.0 + (-x).exp()),
         }
     }
@@ -173,7 +185,11 @@ mod tests {
                 let truth = exact(activation, f64::from(x));
                 // A few f32 roundings (6e-8) of intermediate values of size one, more for larger outputs.
                 let tolerance = 4e-7 * truth.abs().max(0.3);
-                assert!((f64::from(value[0]) - truth).abs() < tolerance, "{activation:?}({x}) = {}", value[0]);
+                assert!(
+                    (f64::from(value[0]) - truth).abs() < tolerance,
+                    "{activation:?}({x}) = {}",
+                    value[0]
+                );
             }
         }
     }
@@ -201,7 +217,11 @@ mod tests {
                 let mut grad = [1.0_f32];
                 chain(activation, &saved, &mut grad);
                 // f32 values of size one, finite difference good to 1e-9.
-                assert!((f64::from(grad[0]) - slope).abs() < 2e-6, "{activation:?} at {x}: {} {slope}", grad[0]);
+                assert!(
+                    (f64::from(grad[0]) - slope).abs() < 2e-6,
+                    "{activation:?} at {x}: {} {slope}",
+                    grad[0]
+                );
             }
         }
     }

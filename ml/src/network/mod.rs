@@ -40,11 +40,19 @@ impl NetworkTensors {
             .map(|layer| {
                 let weight = take(layer.outputs * layer.inputs);
                 let bias = take(layer.outputs);
-                let weight = Tensor::from_data(TensorData::new(weight, [layer.outputs, layer.inputs]), device);
+                let weight =
+                    Tensor::from_data(TensorData::new(weight, [layer.outputs, layer.inputs]), device);
                 let bias = Tensor::from_data(TensorData::new(bias, [layer.outputs]), device);
-                let (weight, bias) =
-                    if device.is_autodiff() { (weight.require_grad(), bias.require_grad()) } else { (weight, bias) };
-                LayerTensors { weight, bias, layer: layer.clone() }
+                let (weight, bias) = if device.is_autodiff() {
+                    (weight.require_grad(), bias.require_grad())
+                } else {
+                    (weight, bias)
+                };
+                LayerTensors {
+                    weight,
+                    bias,
+                    layer: layer.clone(),
+                }
             })
             .collect();
         assert!(rest.is_empty(), "{} parameters too many", rest.len());
@@ -55,7 +63,12 @@ impl NetworkTensors {
     #[must_use]
     pub fn forward(&self, windows: Tensor<2>) -> Tensor<2> {
         self.layers.iter().fold(windows, |x, tensors| {
-            dense(x, tensors.weight.clone(), tensors.bias.clone(), &tensors.layer.activations)
+            dense(
+                x,
+                tensors.weight.clone(),
+                tensors.bias.clone(),
+                &tensors.layer.activations,
+            )
         })
     }
 
@@ -66,7 +79,13 @@ impl NetworkTensors {
     ///
     /// # Panics
     /// When the device does not record gradients, or `gradient` has another length.
-    pub fn loss_and_gradient(&self, windows: Tensor<2>, targets: Tensor<2>, divisor: f32, gradient: &mut [f32]) -> f32 {
+    pub fn loss_and_gradient(
+        &self,
+        windows: Tensor<2>,
+        targets: Tensor<2>,
+        divisor: f32,
+        gradient: &mut [f32],
+    ) -> f32 {
         let error = self.forward(windows) - targets;
         let loss = (error.clone() * error).sum() / divisor;
         let value = first_value(&loss.clone().inner().into_data());
@@ -75,13 +94,17 @@ impl NetworkTensors {
         for tensors in &self.layers {
             let weight = tensors.weight.grad_remove(&mut grads).map(Tensor::into_data);
             let bias = tensors.bias.grad_remove(&mut grads).map(Tensor::into_data);
-            for (data, count) in
-                [(weight, tensors.layer.outputs * tensors.layer.inputs), (bias, tensors.layer.outputs)]
-            {
+            for (data, count) in [
+                (weight, tensors.layer.outputs * tensors.layer.inputs),
+                (bias, tensors.layer.outputs),
+            ] {
                 let (head, tail) = rest.split_at_mut(count);
                 rest = tail;
                 let data = data.expect("every parameter takes part in the loss");
-                for (slot, g) in head.iter_mut().zip(data.as_slice::<f32>().expect("parameters are f32")) {
+                for (slot, g) in head
+                    .iter_mut()
+                    .zip(data.as_slice::<f32>().expect("parameters are f32"))
+                {
                     *slot += g;
                 }
             }

@@ -44,7 +44,10 @@ impl PackedLayer {
         assert_eq!(map.weight.len(), activated * inputs, "weights fit biases");
         let panel_count = outputs.div_ceil(LANES);
         let mut panels = vec![0.0; panel_count * inputs * LANES];
-        let rows = map.weight.chunks(inputs.max(1)).chain(tail.weight.chunks(inputs.max(1)));
+        let rows = map
+            .weight
+            .chunks(inputs.max(1))
+            .chain(tail.weight.chunks(inputs.max(1)));
         for (output, row) in rows.enumerate() {
             let panel = &mut panels[output / LANES * inputs * LANES..];
             for (input, &weight) in row.iter().enumerate() {
@@ -53,7 +56,14 @@ impl PackedLayer {
         }
         let mut bias: Vec<f32> = map.bias.iter().chain(&tail.bias).copied().collect();
         bias.resize(panel_count * LANES, 0.0);
-        Self { inputs, outputs, panels, bias, activations: activations.to_vec(), activated }
+        Self {
+            inputs,
+            outputs,
+            panels,
+            bias,
+            activations: activations.to_vec(),
+            activated,
+        }
     }
 
     /// Values in.
@@ -83,7 +93,10 @@ impl PackedLayer {
         if rows == 0 {
             return;
         }
-        assert!(x.len() >= (rows - 1) * stride + self.inputs, "inputs of {rows} rows");
+        assert!(
+            x.len() >= (rows - 1) * stride + self.inputs,
+            "inputs of {rows} rows"
+        );
         assert!(out.len() >= rows * self.padded(), "room for {rows} rows");
         match level() {
             #[cfg(target_arch = "x86_64")]
@@ -131,7 +144,12 @@ impl PackedLayer {
     }
 
     #[inline(always)]
-    fn row_block<const R: usize, const P: usize, const FMA: bool>(&self, x: &[f32], stride: usize, out: &mut [f32]) {
+    fn row_block<const R: usize, const P: usize, const FMA: bool>(
+        &self,
+        x: &[f32],
+        stride: usize,
+        out: &mut [f32],
+    ) {
         let panel_count = self.bias.len() / LANES;
         let mut panel = 0;
         while panel + P <= panel_count {
@@ -165,7 +183,11 @@ impl PackedLayer {
                     let w = &weights[p][i];
                     for lane in 0..LANES {
                         let sum = &mut sums[r][p][lane];
-                        *sum = if FMA { value.mul_add(w[lane], *sum) } else { *sum + value * w[lane] };
+                        *sum = if FMA {
+                            value.mul_add(w[lane], *sum)
+                        } else {
+                            *sum + value * w[lane]
+                        };
                     }
                 }
             }
@@ -191,11 +213,19 @@ impl PackedLayer {
         let linear = *values;
         // One match per panel, so that each arm is a vector loop.
         match activation {
-            Activation::Tanh => values.iter_mut().for_each(|v| *v = activate(Activation::Tanh, *v)),
-            Activation::Sigmoid => values.iter_mut().for_each(|v| *v = activate(Activation::Sigmoid, *v)),
-            Activation::Relu => values.iter_mut().for_each(|v| *v = activate(Activation::Relu, *v)),
+            Activation::Tanh => values
+                .iter_mut()
+                .for_each(|v| *v = activate(Activation::Tanh, *v)),
+            Activation::Sigmoid => values
+                .iter_mut()
+                .for_each(|v| *v = activate(Activation::Sigmoid, *v)),
+            Activation::Relu => values
+                .iter_mut()
+                .for_each(|v| *v = activate(Activation::Relu, *v)),
             Activation::Elu => values.iter_mut().for_each(|v| *v = activate(Activation::Elu, *v)),
-            Activation::Silu => values.iter_mut().for_each(|v| *v = activate(Activation::Silu, *v)),
+            Activation::Silu => values
+                .iter_mut()
+                .for_each(|v| *v = activate(Activation::Silu, *v)),
         }
         if first + LANES > self.activated {
             let kept = self.activated.saturating_sub(first);
@@ -245,7 +275,10 @@ mod tests {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             f32::from((state >> 16) as u16) / 32768.0 - 1.0
         };
-        LinearWeights { weight: (0..outputs * inputs).map(|_| next()).collect(), bias: (0..outputs).map(|_| next()).collect() }
+        LinearWeights {
+            weight: (0..outputs * inputs).map(|_| next()).collect(),
+            bias: (0..outputs).map(|_| next()).collect(),
+        }
     }
 
     #[test]
@@ -266,7 +299,11 @@ mod tests {
                             + f64::from(weights.bias[o]);
                         let found = f64::from(out[r * layer.padded() + o]);
                         // Up to 500 f32 products of size one: rounding 6e-8 · √500 · √500.
-                        assert!((found - z.tanh()).abs() < 3e-5, "{outputs}×{inputs}, row {r}: {found} {}", z.tanh());
+                        assert!(
+                            (found - z.tanh()).abs() < 3e-5,
+                            "{outputs}×{inputs}, row {r}: {found} {}",
+                            z.tanh()
+                        );
                     }
                 }
             }

@@ -74,13 +74,17 @@ impl Predictor {
         if layers.is_empty() {
             layers.push(PackedLayer::new(skip.unwrap_or(&empty), &[]));
         }
-        let envelope = config.envelope.as_ref().zip(auxiliary.envelope.as_ref()).map(|(envelope, map)| EnvelopeKernel {
-            projection: PackedLayer::new(map, &[]),
-            components: envelope.components,
-            limit: envelope.limit,
-            min: envelope.min.clone(),
-            max: envelope.max.clone(),
-        });
+        let envelope = config
+            .envelope
+            .as_ref()
+            .zip(auxiliary.envelope.as_ref())
+            .map(|(envelope, map)| EnvelopeKernel {
+                projection: PackedLayer::new(map, &[]),
+                components: envelope.components,
+                limit: envelope.limit,
+                min: envelope.min.clone(),
+                max: envelope.max.clone(),
+            });
         Self {
             steps: config.window_steps,
             inputs: Scaling::from_config(&config.inputs),
@@ -139,7 +143,12 @@ impl Predictor {
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
             skip: vec![0.0; BLOCK_ROWS * self.targets.len()],
-            projected: vec![0.0; self.envelope.as_ref().map_or(0, |e| BLOCK_ROWS * e.projection.padded())],
+            projected: vec![
+                0.0;
+                self.envelope
+                    .as_ref()
+                    .map_or(0, |e| BLOCK_ROWS * e.projection.padded())
+            ],
         }
     }
 
@@ -166,11 +175,16 @@ impl Predictor {
     pub fn predict_windows(&self, windows: &[f64], out: &mut [f64], workspace: &mut Workspace) {
         let size = self.window_len();
         assert_eq!(windows.len() % size, 0, "whole windows");
-        assert_eq!(out.len(), windows.len() / size * self.targets.len(), "one row of estimates per window");
+        assert_eq!(
+            out.len(),
+            windows.len() / size * self.targets.len(),
+            "one row of estimates per window"
+        );
         let mut scaled = std::mem::take(&mut workspace.window);
         scaled.resize(BLOCK_ROWS * size, 0.0);
-        for (block, estimates) in
-            windows.chunks(BLOCK_ROWS * size).zip(out.chunks_mut(BLOCK_ROWS * self.targets.len()))
+        for (block, estimates) in windows
+            .chunks(BLOCK_ROWS * size)
+            .zip(out.chunks_mut(BLOCK_ROWS * self.targets.len()))
         {
             self.scale_rows(block, &mut scaled);
             let rows = block.len() / size;
@@ -204,7 +218,8 @@ impl Predictor {
         let width = self.inputs.len();
         let mut scaled = vec![0.0_f32; rows * width];
         for (channel, column) in columns.iter().enumerate() {
-            self.inputs.scale_column(channel, column, &mut scaled[channel..], width);
+            self.inputs
+                .scale_column(channel, column, &mut scaled[channel..], width);
         }
         let count = (rows + 1).saturating_sub(self.steps);
         let targets = self.targets.len();
@@ -224,7 +239,11 @@ impl Predictor {
             first += block;
         }
         self.outside_range(columns, &mut inside);
-        SeriesEstimates { first_row: self.steps - 1, columns: estimates, inside }
+        SeriesEstimates {
+            first_row: self.steps - 1,
+            columns: estimates,
+            inside,
+        }
     }
 
     /// Half width of the 90 % interval around an estimate; absent when the model has none.
@@ -241,9 +260,12 @@ impl Predictor {
     pub fn window_inside(&self, window: &[f64], workspace: &mut Workspace) -> Option<bool> {
         let envelope = self.envelope.as_ref()?;
         let width = self.inputs.len();
-        let in_range = window
-            .chunks(width)
-            .all(|row| row.iter().zip(&envelope.min).zip(&envelope.max).all(|((v, min), max)| v >= min && v <= max));
+        let in_range = window.chunks(width).all(|row| {
+            row.iter()
+                .zip(&envelope.min)
+                .zip(&envelope.max)
+                .all(|((v, min), max)| v >= min && v <= max)
+        });
         let mut scaled = std::mem::take(&mut workspace.window);
         self.scale_rows(window, &mut scaled);
         let mut inside = Vec::with_capacity(1);
@@ -256,7 +278,13 @@ impl Predictor {
     /// targets per window in `workspace.scaled`.
     fn block(&self, x: &[f32], stride: usize, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
-        let Workspace { scaled, ping, pong, skip, .. } = workspace;
+        let Workspace {
+            scaled,
+            ping,
+            pong,
+            skip,
+            ..
+        } = workspace;
         self.layers[0].forward(x, stride, rows, ping);
         let padded = self.layers[0].padded();
         if self.has_skip {
@@ -285,9 +313,18 @@ impl Predictor {
         }
     }
 
-    fn inside_block(&self, x: &[f32], stride: usize, rows: usize, inside: &mut Vec<bool>, workspace: &mut Workspace) {
+    fn inside_block(
+        &self,
+        x: &[f32],
+        stride: usize,
+        rows: usize,
+        inside: &mut Vec<bool>,
+        workspace: &mut Workspace,
+    ) {
         let Some(envelope) = &self.envelope else { return };
-        envelope.projection.forward(x, stride, rows, &mut workspace.projected);
+        envelope
+            .projection
+            .forward(x, stride, rows, &mut workspace.projected);
         let padded = envelope.projection.padded();
         for row in workspace.projected[..rows * padded].chunks(padded) {
             let squares: f32 = row[..envelope.components].iter().map(|v| v * v).sum();
@@ -323,7 +360,10 @@ impl Predictor {
 
     fn unscale(&self, rows: usize, out: &mut [f64], workspace: &Workspace) {
         let targets = self.targets.len();
-        for (estimates, row) in out.chunks_mut(targets).zip(workspace.scaled[..rows * targets].chunks(targets)) {
+        for (estimates, row) in out
+            .chunks_mut(targets)
+            .zip(workspace.scaled[..rows * targets].chunks(targets))
+        {
             for (t, (slot, &value)) in estimates.iter_mut().zip(row).enumerate() {
                 *slot = self.targets.unscale(t, f64::from(value));
             }

@@ -27,7 +27,11 @@ impl Adam {
     /// At rest, for `count` parameters.
     #[must_use]
     pub fn new(count: usize) -> Self {
-        Self { first: vec![0.0; count], second: vec![0.0; count], steps: 0 }
+        Self {
+            first: vec![0.0; count],
+            second: vec![0.0; count],
+            steps: 0,
+        }
     }
 
     /// One step with learning rate `rate`.
@@ -43,7 +47,14 @@ impl Adam {
         let correction_2 = 1.0 - f64::from(BETA_2).powi(t);
         #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
         let (rate, root) = ((rate / correction_1) as f32, correction_2.sqrt().recip() as f32);
-        update(parameters, gradient, &mut self.first, &mut self.second, rate, root);
+        update(
+            parameters,
+            gradient,
+            &mut self.first,
+            &mut self.second,
+            rate,
+            root,
+        );
     }
 }
 
@@ -55,7 +66,14 @@ crate::network::elementwise::vectorised!(
 );
 
 #[inline(always)]
-fn update_generic(parameters: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32], rate: f32, root: f32) {
+fn update_generic(
+    parameters: &mut [f32],
+    gradient: &[f32],
+    first: &mut [f32],
+    second: &mut [f32],
+    rate: f32,
+    root: f32,
+) {
     for (((p, g), m), v) in parameters.iter_mut().zip(gradient).zip(first).zip(second) {
         *m = BETA_1 * *m + (1.0 - BETA_1) * g;
         *v = BETA_2 * *v + (1.0 - BETA_2) * g * g;

@@ -89,8 +89,10 @@ impl TrainState {
             .map(|(name, data)| Ok((*name, TensorView::new(Dtype::F32, vec![data.len() / 4], data)?)))
             .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()
             .map_err(io::Error::other)?;
-        let metadata =
-            HashMap::from([(METADATA_KEY.to_owned(), serde_json::to_string(&self.counters).map_err(io::Error::other)?)]);
+        let metadata = HashMap::from([(
+            METADATA_KEY.to_owned(),
+            serde_json::to_string(&self.counters).map_err(io::Error::other)?,
+        )]);
         let content = serialize(views, Some(metadata)).map_err(io::Error::other)?;
         let temporary = dir.join(format!("{FILE}.part"));
         let mut file = File::create(&temporary)?;
@@ -105,14 +107,24 @@ impl TrainState {
     pub fn load(dir: &Path, fingerprint: &str) -> Option<Self> {
         let content = fs::read(path(dir)).ok()?;
         let (_, metadata) = SafeTensors::read_metadata(&content).ok()?;
-        let counters: Counters = serde_json::from_str(metadata.metadata().as_ref()?.get(METADATA_KEY)?).ok()?;
+        let counters: Counters =
+            serde_json::from_str(metadata.metadata().as_ref()?.get(METADATA_KEY)?).ok()?;
         if counters.fingerprint != fingerprint {
             return None;
         }
         let tensors = SafeTensors::deserialize(&content).ok()?;
         let vector = |name: &str| Some(from_bytes(tensors.tensor(name).ok()?.data()));
-        let adam = Adam { first: vector("first")?, second: vector("second")?, steps: counters.steps };
-        Some(Self { parameters: vector("parameters")?, best_parameters: vector("best")?, adam, counters })
+        let adam = Adam {
+            first: vector("first")?,
+            second: vector("second")?,
+            steps: counters.steps,
+        };
+        Some(Self {
+            parameters: vector("parameters")?,
+            best_parameters: vector("best")?,
+            adam,
+            counters,
+        })
     }
 
     /// Removes the checkpoint: the training is over and its model written.
@@ -140,5 +152,8 @@ pub fn to_bytes(values: &[f32]) -> Vec<u8> {
 /// Values of little-endian bytes; a tail of fewer than four bytes is left out.
 #[must_use]
 pub fn from_bytes(bytes: &[u8]) -> Vec<f32> {
-    bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+    bytes
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+        .collect()
 }

@@ -102,7 +102,9 @@ pub enum TrainError {
         value: f64,
     },
     /// The data set does not say how long a window is.
-    #[error("the data set has no settling runs from which the window length could follow; give the window in seconds")]
+    #[error(
+        "the data set has no settling runs from which the window length could follow; give the window in seconds"
+    )]
     NoWindow,
     /// Too few runs.
     #[error(
@@ -116,7 +118,9 @@ pub enum TrainError {
         validation: usize,
     },
     /// The loss grew beyond bounds or is not a number; the checkpoint before it is kept.
-    #[error("the training diverged in epoch {epoch}: loss {loss:.3e} with learning rate {learning_rate:.3e}; try a smaller one")]
+    #[error(
+        "the training diverged in epoch {epoch}: loss {loss:.3e} with learning rate {learning_rate:.3e}; try a smaller one"
+    )]
     Diverged {
         /// Epoch.
         epoch: usize,
@@ -193,9 +197,15 @@ pub fn fit(
     let resumed = TrainState::load(checkpoint_dir, &fingerprint);
     let resumed_at = resumed.as_ref().map(|state| state.counters.epoch);
     let mut state = resumed.unwrap_or_else(|| TrainState::new(problem.parameters.clone(), fingerprint));
-    let mut clock = Clock { started: Instant::now(), before_s: state.counters.elapsed_s };
+    let mut clock = Clock {
+        started: Instant::now(),
+        before_s: state.counters.elapsed_s,
+    };
     let mut saved_at = Instant::now();
-    let limits = Limits { problem, steps_per_epoch: problem.train.windows.len().div_ceil(problem.recipe.batch) };
+    let limits = Limits {
+        problem,
+        steps_per_epoch: problem.train.windows.len().div_ceil(problem.recipe.batch),
+    };
     let ended_by = loop {
         if let Some(end) = limits.reached(&state, clock.elapsed_s()) {
             break end;
@@ -220,14 +230,19 @@ pub fn fit(
             validate(problem, &mut state, train_loss, fraction);
         }
         state.counters.elapsed_s = clock.elapsed_s();
-        clock = Clock { started: Instant::now(), before_s: state.counters.elapsed_s };
+        clock = Clock {
+            started: Instant::now(),
+            before_s: state.counters.elapsed_s,
+        };
         if saved_at.elapsed() >= CHECKPOINT_INTERVAL {
             state.save(checkpoint_dir).map_err(TrainError::Checkpoint)?;
             saved_at = Instant::now();
         }
         if report(fraction, train_loss, &state, &clock).is_break() {
             state.save(checkpoint_dir).map_err(TrainError::Checkpoint)?;
-            return Err(TrainError::Cancelled { epoch: state.counters.epoch });
+            return Err(TrainError::Cancelled {
+                epoch: state.counters.epoch,
+            });
         }
     };
     if state.counters.best_loss.is_none() {
@@ -284,7 +299,11 @@ impl Limits<'_> {
         let recipe = &self.problem.recipe;
         let counters = &state.counters;
         let last_loss = counters.history.last().map(|h| h.train_loss);
-        if recipe.loss_threshold.zip(last_loss).is_some_and(|(threshold, loss)| loss < threshold) {
+        if recipe
+            .loss_threshold
+            .zip(last_loss)
+            .is_some_and(|(threshold, loss)| loss < threshold)
+        {
             return Some(TrainingEnd::LossThreshold);
         }
         if counters.epoch >= recipe.epochs {
@@ -293,7 +312,12 @@ impl Limits<'_> {
         if recipe.time_limit_s.is_some_and(|limit| elapsed_s >= limit) {
             return Some(TrainingEnd::TimeLimit);
         }
-        let since_best = counters.history.iter().rev().take_while(|h| h.epoch > counters.best_epoch).count();
+        let since_best = counters
+            .history
+            .iter()
+            .rev()
+            .take_while(|h| h.epoch > counters.best_epoch)
+            .count();
         (!recipe.cosine && since_best >= PATIENCE).then_some(TrainingEnd::EarlyStopping)
     }
 }
@@ -321,7 +345,11 @@ fn epoch(
         let rate = limits.rate(fraction);
         let loss = batch_gradient(problem, &state.parameters, batch, &mut gradient);
         if !loss.is_finite() || loss > DIVERGENCE {
-            return Err(TrainError::Diverged { epoch: number, loss, learning_rate: rate });
+            return Err(TrainError::Diverged {
+                epoch: number,
+                loss,
+                learning_rate: rate,
+            });
         }
         state.adam.step(&mut state.parameters, &gradient, rate);
         sum += loss * batch.len() as f64;
@@ -356,7 +384,13 @@ pub fn batch_gradient(problem: &Problem, parameters: &[f32], batch: &[u32], grad
     f64::from(a) + f64::from(b)
 }
 
-fn part_gradient(problem: &Problem, parameters: &[f32], batch: &[u32], divisor: f32, gradient: &mut [f32]) -> f32 {
+fn part_gradient(
+    problem: &Problem,
+    parameters: &[f32],
+    batch: &[u32],
+    divisor: f32,
+    gradient: &mut [f32],
+) -> f32 {
     let plain = Device::flex();
     let device = plain.clone().autodiff();
     let (windows, wanted) = gather(&problem.train, batch.iter().map(|&w| w as usize));
@@ -391,9 +425,14 @@ fn whiten(problem: &Problem, windows: Tensor<2>) -> Tensor<2> {
     }
     let device = windows.device();
     let size = problem.whitening.projection.len() / components;
-    let projection =
-        Tensor::from_data(TensorData::new(problem.whitening.projection.clone(), [components, size]), &device);
-    let offset = Tensor::from_data(TensorData::new(problem.whitening.offset.clone(), [components]), &device);
+    let projection = Tensor::from_data(
+        TensorData::new(problem.whitening.projection.clone(), [components, size]),
+        &device,
+    );
+    let offset = Tensor::from_data(
+        TensorData::new(problem.whitening.offset.clone(), [components]),
+        &device,
+    );
     crate::network::dense::dense(windows, projection, offset, &[])
 }
 
@@ -401,7 +440,11 @@ fn whiten(problem: &Problem, windows: Tensor<2>) -> Tensor<2> {
 fn validate(problem: &Problem, state: &mut TrainState, train_loss: f64, fraction: f64) {
     let loss = validation_loss(problem, &state.parameters);
     state.counters.validated_at = fraction;
-    state.counters.history.push(EpochRecord { epoch: state.counters.epoch, train_loss, validation_loss: loss });
+    state.counters.history.push(EpochRecord {
+        epoch: state.counters.epoch,
+        train_loss,
+        validation_loss: loss,
+    });
     if state.counters.best_loss.is_none_or(|best| loss < best) {
         state.counters.best_loss = Some(loss);
         state.counters.best_epoch = state.counters.epoch;
@@ -421,7 +464,11 @@ fn validation_loss(problem: &Problem, parameters: &[f32]) -> f64 {
         let output = network.forward(whiten(problem, batch_tensor(windows, last - first, &device)));
         let output = output.into_data();
         let values = output.as_slice::<f32>().expect("the network's output is f32");
-        sum += values.iter().zip(&wanted).map(|(o, w)| f64::from(o - w).powi(2)).sum::<f64>();
+        sum += values
+            .iter()
+            .zip(&wanted)
+            .map(|(o, w)| f64::from(o - w).powi(2))
+            .sum::<f64>();
     }
     sum / (count * problem.spec.targets.len()) as f64
 }

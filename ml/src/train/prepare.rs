@@ -133,15 +133,21 @@ impl Whitening {
 #[must_use]
 pub fn default_inputs(channels: &[Channel]) -> Vec<String> {
     let wanted = ["valve_", "length_", "velocity_", "pressure_"];
-    let is_input = |c: &&Channel| c.role != ChannelRole::Target && wanted.iter().any(|w| c.name.starts_with(w));
+    let is_input =
+        |c: &&Channel| c.role != ChannelRole::Target && wanted.iter().any(|w| c.name.starts_with(w));
     channels.iter().filter(is_input).map(|c| c.name.clone()).collect()
 }
 
 /// Targets by default: every structural channel except axial and out-of-plane deflection.
 #[must_use]
 pub fn default_targets(channels: &[Channel]) -> Vec<String> {
-    let secondary = |name: &str| name.starts_with("deflection_") && (name.ends_with("_x_m") || name.ends_with("_z_m"));
-    channels.iter().filter(|c| c.role == ChannelRole::Target && !secondary(&c.name)).map(|c| c.name.clone()).collect()
+    let secondary =
+        |name: &str| name.starts_with("deflection_") && (name.ends_with("_x_m") || name.ends_with("_z_m"));
+    channels
+        .iter()
+        .filter(|c| c.role == ChannelRole::Target && !secondary(&c.name))
+        .map(|c| c.name.clone())
+        .collect()
 }
 
 impl Problem {
@@ -156,7 +162,12 @@ impl Problem {
         let train_targets = data.train.select(&spec.targets)?;
         let validation_inputs = data.validation.select(&spec.inputs)?;
         let validation_targets = data.validation.select(&spec.targets)?;
-        for runs in [&train_inputs, &train_targets, &validation_inputs, &validation_targets] {
+        for runs in [
+            &train_inputs,
+            &train_targets,
+            &validation_inputs,
+            &validation_targets,
+        ] {
             runs.check()?;
         }
         let published = spec.windows == WindowCut::Disjoint;
@@ -172,7 +183,12 @@ impl Problem {
             let series = Series::new(inputs, &input_scaling);
             let windows = Windows::new(&series.run_rows, steps, cut);
             check_lengths(inputs, steps, &windows)?;
-            Ok(Part { targets: target_rows(targets, &target_scaling), series, windows, wanted: Vec::new() })
+            Ok(Part {
+                targets: target_rows(targets, &target_scaling),
+                series,
+                windows,
+                wanted: Vec::new(),
+            })
         };
         if data.train.runs.len() < MIN_TRAIN_RUNS || data.validation.runs.is_empty() {
             return Err(TrainError::TooFewRuns {
@@ -195,9 +211,17 @@ impl Problem {
             part.wanted = wanted(part, steps, skip, &wanted_scale);
         }
 
-        let whitening = if published { Whitening::default() } else { whitening(&spectrum, &moments) };
+        let whitening = if published {
+            Whitening::default()
+        } else {
+            whitening(&spectrum, &moments)
+        };
         let window_values = steps * spec.inputs.len();
-        let first_inputs = if published { window_values } else { whitening.components() };
+        let first_inputs = if published {
+            window_values
+        } else {
+            whitening.components()
+        };
         let layers = structure.layers(first_inputs, spec.targets.len());
         let recipe = recipe(&spec, published, data.train.runs.len(), train.windows.len());
         let parameters = initial_parameters(&layers, spec.seed, 1.0);
@@ -242,7 +266,10 @@ fn check_names(spec: &TrainingSpec) -> Result<(), TrainError> {
     if let Some(name) = spec.targets.iter().find(|t| spec.inputs.contains(t)) {
         return Err(TrainError::TargetIsInput { name: name.clone() });
     }
-    for (what, value) in [("learning_rate", spec.learning_rate), ("time_limit_s", spec.time_limit_s)] {
+    for (what, value) in [
+        ("learning_rate", spec.learning_rate),
+        ("time_limit_s", spec.time_limit_s),
+    ] {
         if let Some(value) = value.filter(|v| !(v.is_finite() && *v > 0.0)) {
             return Err(TrainError::NotPositive { what, value });
         }
@@ -259,7 +286,12 @@ fn check_lengths(runs: &Runs, steps: usize, windows: &Windows) -> Result<(), Tra
     if !windows.is_empty() {
         return Ok(());
     }
-    let longest = runs.runs.iter().map(crate::runs::RunSamples::len).max().unwrap_or(0);
+    let longest = runs
+        .runs
+        .iter()
+        .map(crate::runs::RunSamples::len)
+        .max()
+        .unwrap_or(0);
     Err(TrainError::Window(WindowError::LongerThanRun {
         steps,
         window_s: steps as f64 * runs.sample_time_s,
@@ -274,7 +306,12 @@ fn target_rows(runs: &Runs, scaling: &Scaling) -> TargetRows {
     let mut values = Vec::with_capacity(rows * width);
     for run in &runs.runs {
         for row in 0..run.len() {
-            values.extend(run.columns.iter().enumerate().map(|(t, column)| scaling.scale(t, column[row])));
+            values.extend(
+                run.columns
+                    .iter()
+                    .enumerate()
+                    .map(|(t, column)| scaling.scale(t, column[row])),
+            );
         }
     }
     TargetRows { width, values }
@@ -286,7 +323,13 @@ fn wanted_scale(moments: &WindowMoments, skip: Option<&LinearMap>) -> Vec<f64> {
     const FLOOR: f64 = 1e-7;
     skip.map_or_else(
         || vec![1.0; moments.target_mean.len()],
-        |map| moments.mean_squared_error(map).iter().map(|mse| mse.sqrt().max(FLOOR)).collect(),
+        |map| {
+            moments
+                .mean_squared_error(map)
+                .iter()
+                .map(|mse| mse.sqrt().max(FLOOR))
+                .collect()
+        },
     )
 }
 
@@ -317,11 +360,17 @@ fn whitening(spectrum: &Spectrum, moments: &WindowMoments) -> Whitening {
         .iter()
         .map(|row| -row.iter().zip(&moments.mean).map(|(p, m)| p * m).sum::<f64>() as f32)
         .collect();
-    Whitening { projection: rows.iter().flatten().map(|&v| v as f32).collect(), offset }
+    Whitening {
+        projection: rows.iter().flatten().map(|&v| v as f32).collect(),
+        offset,
+    }
 }
 
 fn recipe(spec: &TrainingSpec, published: bool, runs: usize, windows: usize) -> Recipe {
-    let batch = spec.batch.unwrap_or(if published { (runs / 8).max(1) } else { BATCH }).min(windows);
+    let batch = spec
+        .batch
+        .unwrap_or(if published { (runs / 8).max(1) } else { BATCH })
+        .min(windows);
     let steps_per_epoch = windows.div_ceil(batch);
     let epochs = match (spec.epochs, spec.time_limit_s, published) {
         (Some(epochs), ..) => epochs,
@@ -332,7 +381,11 @@ fn recipe(spec: &TrainingSpec, published: bool, runs: usize, windows: usize) -> 
     Recipe {
         epochs,
         time_limit_s: spec.time_limit_s,
-        learning_rate: spec.learning_rate.unwrap_or(if published { PAPER_LEARNING_RATE } else { LEARNING_RATE }),
+        learning_rate: spec.learning_rate.unwrap_or(if published {
+            PAPER_LEARNING_RATE
+        } else {
+            LEARNING_RATE
+        }),
         cosine: !published,
         batch,
         loss_threshold: published.then_some(PAPER_LOSS_THRESHOLD),
