@@ -329,3 +329,7 @@ fn close_loops(
         gap_m,
     })
 }
+
+#[cfg(test)]
+#[path = "equilibrium_tests.rs"]
+mod tests;

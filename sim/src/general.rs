@@ -194,3 +194,7 @@ fn resolution(channel: &Channel) -> f64 {
         _ => 1e-8,
     }
 }
+
+#[cfg(test)]
+#[path = "general_tests.rs"]
+mod tests;

@@ -2,8 +2,14 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix3xX, Vector3, Vector4};
 
-use crate::body::rotation::skew;
+use hydroflex_openapi::machine::{
+    Attachment, BodySpec, DampingSpec, FlexibleBodySpec, JointKind, JointSpec, MachineFile, MarkerRotation,
+    MassMatrixKind, MaterialSpec, MeshSource,
+};
+
+use crate::body::rotation::{rate_map, skew};
 use crate::reduction::{ReducedBody, ReducedInterface, ReducedNode, ReductionReport};
+use crate::system::{State, System};
 
 /// Repeatable numbers in (−1, 1).
 pub(crate) struct Numbers(u64);
@@ -132,4 +138,96 @@ impl Cloud {
             report: ReductionReport::default(),
         }
     }
+}
+
+/// A rigid arm on a pivot, held by one cylinder with every kind of force.
+pub(crate) fn rig() -> MachineFile {
+    toml::from_str(include_str!("testing_rig.toml")).unwrap()
+}
+
+/// A free flexible cloud, without gravity.
+pub(crate) fn free_cloud(stiffness: f64) -> System {
+    let mut file = cloud_file();
+    file.bodies.retain(|b| b.name() == "cloud");
+    file.joints.clear();
+    file.cylinders.clear();
+    file.gravity_m_per_s2 = [0.0; 3];
+    System::new(&file, &[Cloud::new(9, 4, 5).reduce(stiffness, 0.0)], 0.0).unwrap()
+}
+
+/// Two flexible clouds and an arm with one joint of every kind, and a cylinder between two bodies.
+pub(crate) fn linkage() -> System {
+    let mut file = cloud_file();
+    let mut second = Cloud::new(8, 3, 6).reduce(2e4, 0.0);
+    second.name = "second".to_owned();
+    let bodies = [Cloud::new(9, 4, 5).reduce(1e4, 0.0), second];
+    file.conventions.marker_rotation = MarkerRotation::Exact;
+    System::new(&file, &bodies, 50.0).unwrap()
+}
+
+fn cloud_file() -> MachineFile {
+    let mut file = rig();
+    let flexible = |name: &str| {
+        BodySpec::Flexible(FlexibleBodySpec {
+            name: name.to_owned(),
+            mesh: MeshSource::Given(String::new()),
+            material: MaterialSpec {
+                name: "none".to_owned(),
+                youngs_modulus_pa: 1.0,
+                poisson_ratio: 0.0,
+                density_kg_per_m3: 1.0,
+            },
+            mass_matrix: MassMatrixKind::Lumped,
+            normal_modes: 0,
+            damping: DampingSpec::Rayleigh {
+                mass_factor_per_s: 0.0,
+                stiffness_factor_s: 0.0,
+            },
+            interfaces: Vec::new(),
+        })
+    };
+    file.bodies.push(flexible("cloud"));
+    file.bodies.push(flexible("second"));
+    let at = |body: &str, interface: &str| Attachment {
+        body: body.to_owned(),
+        interface: Some(interface.to_owned()),
+        point_m: None,
+    };
+    let on_arm = |x: f64| Attachment {
+        body: "arm".to_owned(),
+        interface: None,
+        point_m: Some([x, 0.1, 0.2]),
+    };
+    let joint = |name: &str, kind, from, to| JointSpec {
+        name: name.to_owned(),
+        kind,
+        from,
+        to,
+    };
+    file.joints = vec![
+        joint("a", JointKind::Revolute, at("cloud", "end"), at("second", "end")),
+        joint("b", JointKind::Fixed, at("cloud", "end"), on_arm(1.0)),
+        joint("c", JointKind::PlanarPin, at("second", "end"), on_arm(2.0)),
+        joint("d", JointKind::Spherical, at("second", "root"), on_arm(0.5)),
+    ];
+    file.cylinders[0].base = at("second", "end");
+    file.cylinders[0].rod = at("cloud", "end");
+    file
+}
+
+/// A system in a random state of motion, for identities that hold in any state.
+pub(crate) fn random_state(system: &System, seed: u64) -> State {
+    let mut x = Numbers::new(seed);
+    let mut state = system.new_state();
+    for value in state.q.iter_mut().chain(&mut state.v).chain(&mut state.a) {
+        *value = 0.3 * x.next();
+    }
+    for entry in &system.bodies {
+        let range = entry.first_q + 3..entry.first_q + 7;
+        let theta = x.unit4();
+        let rate = rate_map(&theta).transpose() * x.vector() * 0.25;
+        state.q[range.clone()].copy_from_slice(theta.as_slice());
+        state.v[range].copy_from_slice(rate.as_slice());
+    }
+    state
 }

@@ -7,3 +7,6 @@ mod update;
 pub use scheme::Scheme;
 pub use step::{StepError, Stepper};
 pub(crate) use update::{Increment, add_increment, normalise};
+
+#[cfg(test)]
+mod tests;

@@ -13,3 +13,6 @@ pub use solve::{Coefficients, CylinderRows};
 pub use state::State;
 pub use system::{PayloadMass, System, SystemError};
 pub use workspace::{CylinderMotion, Workspace};
+
+#[cfg(test)]
+mod tests;
