@@ -1,9 +1,10 @@
 //! Channels: the named, unit-carrying columns of a trajectory.
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// What a channel is to a learner.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ChannelRole {
     /// Commanded from outside.
@@ -17,7 +18,7 @@ pub enum ChannelRole {
 }
 
 /// One column of samples.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Channel {
     /// Column name, unit last: `pressure_lift_piston_pa`.
     pub name: String,

@@ -74,6 +74,19 @@ fn default_settling_runs() -> u64 {
     8
 }
 
+impl JobSpec {
+    /// Steps of a run: its length in sample times, rounded. A run has one sample more.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "`as` saturates, and validation bounds the length"
+    )]
+    pub fn steps(&self) -> usize {
+        (self.duration_s / self.sample_time_s).round() as usize
+    }
+}
+
 /// Which machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(untagged)]
@@ -187,6 +200,35 @@ pub enum RunFlag {
     BelowTankPressure,
     /// A chamber rose above supply pressure.
     AboveSupplyPressure,
+}
+
+impl RunFlag {
+    /// Every flag.
+    pub const ALL: [Self; 5] = [
+        Self::StrokeCutoff,
+        Self::EndStop,
+        Self::Cavitation,
+        Self::BelowTankPressure,
+        Self::AboveSupplyPressure,
+    ];
+
+    /// Name in JSON and in data sets.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::StrokeCutoff => "stroke_cutoff",
+            Self::EndStop => "end_stop",
+            Self::Cavitation => "cavitation",
+            Self::BelowTankPressure => "below_tank_pressure",
+            Self::AboveSupplyPressure => "above_supply_pressure",
+        }
+    }
+
+    /// The flag of that name.
+    #[must_use]
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|flag| flag.as_str() == name)
+    }
 }
 
 /// How a run ended.

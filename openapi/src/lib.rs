@@ -7,6 +7,7 @@
 pub mod machine;
 pub mod channel;
 pub mod job;
+pub mod dataset;
 pub mod id;
 pub mod status;
 pub mod event;

@@ -16,3 +16,4 @@ pub mod simulator;
 
 #[cfg(test)]
 pub(crate) mod testing;
+pub mod scenario;
