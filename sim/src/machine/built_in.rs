@@ -7,10 +7,16 @@ pub(super) struct BuiltInMachine {
 }
 
 /// The machines; the first is the default.
-pub(super) const MACHINES: [BuiltInMachine; 1] = [BuiltInMachine {
-    name: "lift-boom-published",
-    text: include_str!("../../machines/lift-boom-published.toml"),
-}];
+pub(super) const MACHINES: [BuiltInMachine; 2] = [
+    BuiltInMachine {
+        name: "lift-boom",
+        text: include_str!("../../machines/lift-boom.toml"),
+    },
+    BuiltInMachine {
+        name: "lift-boom-published",
+        text: include_str!("../../machines/lift-boom-published.toml"),
+    },
+];
 
 /// A mesh file.
 pub(super) struct BuiltInMesh {
@@ -19,7 +25,10 @@ pub(super) struct BuiltInMesh {
 }
 
 /// The meshes.
-pub(super) const MESHES: [BuiltInMesh; 0] = [];
+pub(super) const MESHES: [BuiltInMesh; 1] = [BuiltInMesh {
+    name: "lift-boom",
+    text: include_str!("../../machines/lift-boom/lift-boom.inp"),
+}];
 
 /// Text of a built-in mesh.
 pub(super) fn mesh(name: &str) -> Option<&'static str> {

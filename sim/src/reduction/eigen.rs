@@ -1,15 +1,21 @@
-//! Lowest modes of `K v = ω² M v` by a block Krylov method with the factor of `K + s M`.
+//! Lowest modes of `K v = ω² M v` by block Lanczos with the factor of `K + s M`.
 //!
 //! Shift-and-invert turns the lowest modes into the largest eigenvalues `θ = 1/(ω² + s)` of the
-//! operator `A = (K + s M)⁻¹ M`, which is symmetric in the M inner product. Each block `A V_j` is
-//! made M-orthonormal to all earlier ones (twice, which is enough: Giraud et al. 2005), and the
-//! Rayleigh-Ritz step works on all of them. A block rather than one vector finds the equal
-//! frequencies of symmetric structures.
+//! operator `A = (K + s M)⁻¹ M`, which is symmetric in the M inner product:
+//!
+//! ```text
+//! A V_j = V_1 H_1j + … + V_j H_jj + V_{j+1} R,     V M-orthonormal
+//! ```
+//!
+//! Each block is made orthogonal to all earlier ones twice (enough: Giraud et al. 2005). With
+//! `T = Vᵀ M A V` and `T s = θ s`, the Ritz vector `V s` has the residual `‖R s_j‖`, where `s_j` is
+//! the last block of s. A block rather than one vector finds the equal frequencies of symmetric
+//! structures.
 
 use super::ReductionError;
 use super::factor::StiffnessFactor;
 use crate::fe::NodalMass;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
 /// Modes over the free unknowns, ascending in frequency.
 pub(super) struct Modes {
@@ -23,11 +29,11 @@ pub(super) struct Modes {
 /// over the relative gap of the frequencies, that of the frequency its square.
 const RESIDUAL_TOLERANCE: f64 = 1e-13;
 
-/// Below this a residual that no longer shrinks is rounding of a badly conditioned mesh, and taken.
-const ROUNDING_RESIDUAL: f64 = 1e-9;
+/// Blocks after which the search is given up; six to ten are needed.
+const MAX_BLOCKS: usize = 80;
 
-/// Blocks after which the search is given up; about six are needed.
-const MAX_BLOCKS: usize = 60;
+/// Part of a vector that must be left after taking out the basis; less is rounding.
+const INDEPENDENT_PART: f64 = 1e-13;
 
 /// Finds the `count` lowest modes. `shift_per_s2` is the shift the factor was made with.
 pub(super) fn lowest_modes(
@@ -49,40 +55,49 @@ pub(super) fn lowest_modes(
             unknowns: n,
         });
     }
-    let width = (count + 2).min(n).min(8);
     let mut search = Search {
         factor,
         mass,
-        basis: Vec::new(),
-        mass_basis: Vec::new(),
-        image: Vec::new(),
+        basis: DMatrix::zeros(n, 0),
+        mass_basis: DMatrix::zeros(n, 0),
+        projected: DMatrix::zeros(0, 0),
     };
-    let mut block = start_block(n, width);
-    let mut worst_residual = f64::INFINITY;
+    let mut last = search.append(start_block(n, (count + 2).min(n).min(8))).ncols();
+    let mut residual = f64::INFINITY;
     for _ in 0..MAX_BLOCKS {
-        let last_residual = worst_residual;
-        let first_new = search.basis.len();
-        search.append(block);
-        if search.basis.len() > first_new {
-            search.apply_operator(first_new);
-        }
-        let exhausted = search.basis.len() == first_new || search.basis.len() == n;
-        if search.basis.len() >= count {
-            let ritz = search.ritz(count);
-            worst_residual = ritz.worst_residual;
-            let stalled = worst_residual < ROUNDING_RESIDUAL && worst_residual > 0.5 * last_residual;
-            if worst_residual < RESIDUAL_TOLERANCE || stalled || exhausted {
-                return Ok(ritz.into_modes(shift_per_s2));
+        let next = search.step(last);
+        let size = search.projected.nrows();
+        let eigen = search.projected.clone().symmetric_eigen();
+        let mut order: Vec<usize> = (0..size).collect();
+        order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+        order.truncate(count);
+        let theta: Vec<f64> = order.iter().map(|i| eigen.eigenvalues[*i]).collect();
+
+        let remainder = search.append(next);
+        let exhausted = remainder.nrows() == 0 || size == n;
+        if size >= count {
+            let s = eigen.eigenvectors.select_columns(&order);
+            let tail = remainder * s.rows(size - last, last);
+            residual = tail
+                .column_iter()
+                .zip(&theta)
+                .map(|(column, theta)| column.norm() / theta.abs())
+                .fold(0.0, f64::max);
+            if residual < RESIDUAL_TOLERANCE || exhausted {
+                return Ok(Modes {
+                    omega_squared: theta.iter().map(|t| 1.0 / t - shift_per_s2).collect(),
+                    shapes: search.basis.columns(0, size) * s,
+                });
             }
         }
         if exhausted {
             break;
         }
-        block = DMatrix::from_columns(&search.image[first_new..]);
+        last = search.basis.ncols() - size;
     }
     Err(ReductionError::ModesNotConverged {
         wanted: count,
-        residual: worst_residual,
+        residual,
     })
 }
 
@@ -98,26 +113,11 @@ struct Search<'a> {
     factor: &'a StiffnessFactor,
     mass: &'a NodalMass,
     /// M-orthonormal vectors V.
-    basis: Vec<DVector<f64>>,
+    basis: DMatrix<f64>,
     /// M V.
-    mass_basis: Vec<DVector<f64>>,
-    /// A V.
-    image: Vec<DVector<f64>>,
-}
-
-struct Ritz {
-    theta: Vec<f64>,
-    shapes: DMatrix<f64>,
-    worst_residual: f64,
-}
-
-impl Ritz {
-    fn into_modes(self, shift_per_s2: f64) -> Modes {
-        Modes {
-            omega_squared: self.theta.iter().map(|t| 1.0 / t - shift_per_s2).collect(),
-            shapes: self.shapes,
-        }
-    }
+    mass_basis: DMatrix<f64>,
+    /// T = Vᵀ M A V over the blocks that A was applied to.
+    projected: DMatrix<f64>,
 }
 
 impl Search<'_> {
@@ -127,77 +127,78 @@ impl Search<'_> {
         self.factor.gather(&self.mass.multiply(&nodal))
     }
 
-    /// Orthonormalises the columns against the basis and each other, and appends them; a column
-    /// that lies in the span already is dropped.
-    fn append(&mut self, block: DMatrix<f64>) {
-        for column in block.column_iter() {
-            let mut v = column.into_owned();
-            let mut length = self.norm(&v).0;
-            if length == 0.0 || !length.is_finite() {
+    /// Applies A to the last block of `width` vectors, extends T, and returns what is orthogonal to
+    /// the basis.
+    fn step(&mut self, width: usize) -> DMatrix<f64> {
+        let size = self.basis.ncols();
+        let mut image = self.mass_basis.columns(size - width, width).into_owned();
+        self.factor.solve_in_place(&mut image);
+        let mut h = DMatrix::zeros(size, width);
+        for _ in 0..2 {
+            let part = self.mass_basis.tr_mul(&image);
+            image -= &self.basis * &part;
+            h += part;
+        }
+        let first = size - width;
+        let mut t = std::mem::take(&mut self.projected).resize(size, size, 0.0);
+        for j in 0..width {
+            for i in 0..size {
+                t[(i, first + j)] = h[(i, j)];
+                t[(first + j, i)] = h[(i, j)];
+            }
+        }
+        // the diagonal block is symmetric but for rounding
+        for i in 0..width {
+            for j in 0..i {
+                let mean = 0.5 * (h[(first + i, j)] + h[(first + j, i)]);
+                t[(first + i, first + j)] = mean;
+                t[(first + j, first + i)] = mean;
+            }
+        }
+        self.projected = t;
+        image
+    }
+
+    /// M-orthonormalises the columns and appends them; returns R with `block = new vectors · R`. A
+    /// column that the others span already is dropped.
+    fn append(&mut self, mut block: DMatrix<f64>) -> DMatrix<f64> {
+        let width = block.ncols();
+        let mut mass_block = self.mass_times(&block);
+        let mut r = DMatrix::zeros(width, width);
+        let mut kept = 0;
+        let scale = (0..width)
+            .map(|j| block.column(j).dot(&mass_block.column(j)))
+            .fold(0.0, f64::max)
+            .sqrt();
+        for j in 0..width {
+            for _ in 0..2 {
+                for i in 0..kept {
+                    let part = mass_block.column(i).dot(&block.column(j));
+                    r[(i, j)] += part;
+                    let (q, mq) = (block.column(i).into_owned(), mass_block.column(i).into_owned());
+                    block.column_mut(j).axpy(-part, &q, 1.0);
+                    mass_block.column_mut(j).axpy(-part, &mq, 1.0);
+                }
+            }
+            let length = block.column(j).dot(&mass_block.column(j)).max(0.0).sqrt();
+            if length <= INDEPENDENT_PART * scale || !length.is_finite() {
                 continue;
             }
-            v /= length;
-            for _ in 0..3 {
-                for (b, mb) in self.basis.iter().zip(&self.mass_basis) {
-                    v.axpy(-mb.dot(&v), b, 1.0);
-                }
-                length = self.norm(&v).0;
-                if length < 1e-10 {
-                    break;
-                }
-                v /= length;
-            }
-            if length >= 1e-10 {
-                let mv = self.norm(&v).1;
-                self.basis.push(v);
-                self.mass_basis.push(mv);
-            }
+            r[(kept, j)] = length;
+            let (q, mq) = (block.column(j) / length, mass_block.column(j) / length);
+            block.set_column(kept, &q);
+            mass_block.set_column(kept, &mq);
+            kept += 1;
         }
-    }
-
-    /// M norm of a vector, and M times it.
-    fn norm(&self, v: &DVector<f64>) -> (f64, DVector<f64>) {
-        let column = DMatrix::from_column_slice(v.len(), 1, v.as_slice());
-        let mv = self.mass_times(&column).column(0).into_owned();
-        (v.dot(&mv).max(0.0).sqrt(), mv)
-    }
-
-    fn apply_operator(&mut self, first: usize) {
-        let mut image = DMatrix::from_columns(&self.mass_basis[first..]);
-        self.factor.solve_in_place(&mut image);
-        self.image
-            .extend(image.column_iter().map(|column| column.into_owned()));
-    }
-
-    fn ritz(&self, count: usize) -> Ritz {
-        let size = self.basis.len();
-        let t = DMatrix::from_fn(size, size, |i, j| {
-            0.5 * (self.mass_basis[i].dot(&self.image[j]) + self.mass_basis[j].dot(&self.image[i]))
-        });
-        let eigen = t.symmetric_eigen();
-        let mut order: Vec<usize> = (0..size).collect();
-        order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-        order.truncate(count);
-
-        let n = self.basis[0].len();
-        let mut shapes = DMatrix::zeros(n, count);
-        let mut images = DMatrix::zeros(n, count);
-        for (column, which) in order.iter().enumerate() {
-            for (i, s) in eigen.eigenvectors.column(*which).iter().enumerate() {
-                shapes.column_mut(column).axpy(*s, &self.basis[i], 1.0);
-                images.column_mut(column).axpy(*s, &self.image[i], 1.0);
-            }
-        }
-        let theta: Vec<f64> = order.iter().map(|i| eigen.eigenvalues[*i]).collect();
-        let mut worst_residual: f64 = 0.0;
-        for (column, theta) in theta.iter().enumerate() {
-            let residual = images.column(column) - shapes.column(column) * *theta;
-            worst_residual = worst_residual.max(self.norm(&residual).0 / theta.abs());
-        }
-        Ritz {
-            theta,
-            shapes,
-            worst_residual,
-        }
+        let block = block.columns(0, kept).into_owned();
+        // recomputed: updating M Q alongside loses digits
+        let mass_block = self.mass_times(&block);
+        let size = self.basis.ncols();
+        let grow = |m: DMatrix<f64>| m.resize_horizontally(size + kept, 0.0);
+        self.basis = grow(std::mem::take(&mut self.basis));
+        self.mass_basis = grow(std::mem::take(&mut self.mass_basis));
+        self.basis.columns_mut(size, kept).copy_from(&block);
+        self.mass_basis.columns_mut(size, kept).copy_from(&mass_block);
+        r.rows(0, kept).into_owned()
     }
 }
