@@ -44,4 +44,8 @@ pub struct PredictResponse {
     pub count: u64,
     /// Estimates by column name, in the unit of the name.
     pub estimates: BTreeMap<String, Vec<f64>>,
+    /// For each estimate, whether its window lies in the region that the model was trained on;
+    /// absent if the model does not know that region.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inside_envelope: Option<Vec<bool>>,
 }

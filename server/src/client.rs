@@ -41,7 +41,10 @@ impl Client {
             .connect_timeout(Duration::from_secs(10))
             .build()
             .context("cannot set up the HTTP client")?;
-        Ok(Self { base: url.trim_end_matches('/').to_owned(), http })
+        Ok(Self {
+            base: url.trim_end_matches('/').to_owned(),
+            http,
+        })
     }
 
     /// Address of a path.
@@ -77,7 +80,11 @@ impl Client {
     /// # Errors
     /// If the service cannot be reached, refuses, or answers something else.
     pub fn post_text<T: DeserializeOwned>(&self, path: &str, body: String) -> anyhow::Result<T> {
-        let request = self.http.post(self.url(path)).header("content-type", "application/json").body(body);
+        let request = self
+            .http
+            .post(self.url(path))
+            .header("content-type", "application/json")
+            .body(body);
         self.read(request, path)
     }
 
@@ -87,7 +94,10 @@ impl Client {
     /// If the service cannot be reached or refuses.
     pub fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
         let response = request.send().with_context(|| {
-            format!("cannot reach the service at {} (is `hydroflex serve` running there?)", self.base)
+            format!(
+                "cannot reach the service at {} (is `hydroflex serve` running there?)",
+                self.base
+            )
         })?;
         let status = response.status();
         if status.is_success() {
@@ -98,7 +108,9 @@ impl Client {
     }
 
     fn read<T: DeserializeOwned>(&self, request: RequestBuilder, path: &str) -> anyhow::Result<T> {
-        self.send(request)?.json().with_context(|| format!("unexpected answer from {}", self.url(path)))
+        self.send(request)?
+            .json()
+            .with_context(|| format!("unexpected answer from {}", self.url(path)))
     }
 
     /// Follows a job to its end, drawing a bar for each stage, and returns its last state. A service
@@ -135,7 +147,10 @@ impl Client {
 /// Problem details in the words of the command line.
 fn describe(status: StatusCode, body: &str) -> String {
     let Ok(problem) = serde_json::from_str::<Problem>(body) else {
-        return format!("the service answered {status}: {}", body.chars().take(300).collect::<String>());
+        return format!(
+            "the service answered {status}: {}",
+            body.chars().take(300).collect::<String>()
+        );
     };
     let mut text = format!("{} ({}): {}", problem.title, problem.status, problem.detail);
     for field in &problem.errors {
@@ -166,13 +181,21 @@ impl Stages {
             bars.set_draw_target(indicatif::ProgressDrawTarget::hidden());
         }
         let simulate = bars.add(bar("simulate", 0));
-        Self { bars, simulate, publish: None, train: Vec::new(), quiet }
+        Self {
+            bars,
+            simulate,
+            publish: None,
+            train: Vec::new(),
+            quiet,
+        }
     }
 
     fn show(&mut self, status: &JobStatus) {
         let progress = &status.progress;
-        self.simulate.set_length(progress.runs_total + progress.settling_total);
-        self.simulate.set_position(progress.runs_done + progress.runs_failed + progress.settling_done);
+        self.simulate
+            .set_length(progress.runs_total + progress.settling_total);
+        self.simulate
+            .set_position(progress.runs_done + progress.settling_done);
         let mut note = String::new();
         if let Some(rate) = progress.runs_per_s {
             let _ = write!(note, "{rate:.0} runs/s");
@@ -181,11 +204,16 @@ impl Stages {
             let _ = write!(note, ", {} failed", progress.runs_failed);
         }
         self.simulate.set_message(note);
-        if matches!(status.state, JobState::Publishing | JobState::Training | JobState::Succeeded) {
+        if matches!(
+            status.state,
+            JobState::Publishing | JobState::Training | JobState::Succeeded
+        ) {
             if !self.simulate.is_finished() {
                 self.simulate.finish();
             }
-            let publish = self.publish.get_or_insert_with(|| self.bars.add(bar("publish", 1)));
+            let publish = self
+                .publish
+                .get_or_insert_with(|| self.bars.add(bar("publish", 1)));
             if status.dataset_id.is_some() && !publish.is_finished() {
                 publish.set_position(1);
                 publish.finish();
@@ -198,7 +226,11 @@ impl Stages {
             }
             let bar = &self.train[index];
             if let Some(progress) = &training.progress {
-                #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction in [0, 1]")]
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    clippy::cast_sign_loss,
+                    reason = "a fraction in [0, 1]"
+                )]
                 bar.set_position((progress.fraction.clamp(0.0, 1.0) * 1000.0) as u64);
                 if let Some(loss) = progress.validation_loss.or(progress.loss) {
                     bar.set_message(format!("loss {loss:.2e}"));
@@ -208,7 +240,12 @@ impl Stages {
                 bar.set_position(1000);
                 bar.finish();
             } else if training.state.is_final() && !bar.is_finished() {
-                bar.abandon_with_message(training.reason.clone().unwrap_or_else(|| training.state.to_string()));
+                bar.abandon_with_message(
+                    training
+                        .reason
+                        .clone()
+                        .unwrap_or_else(|| training.state.to_string()),
+                );
             }
         }
     }
@@ -216,9 +253,14 @@ impl Stages {
     fn finish(&self, status: &JobStatus) {
         if !self.quiet && status.state != JobState::Succeeded {
             let reason = status.reason.as_deref().unwrap_or("no reason given");
-            let _ = self.bars.println(format!("job {} {}: {reason}", status.job_id, status.state));
+            let _ = self
+                .bars
+                .println(format!("job {} {}: {reason}", status.job_id, status.state));
         }
-        for bar in std::iter::once(&self.simulate).chain(&self.publish).chain(&self.train) {
+        for bar in std::iter::once(&self.simulate)
+            .chain(&self.publish)
+            .chain(&self.train)
+        {
             if !bar.is_finished() {
                 bar.abandon();
             }
@@ -231,7 +273,9 @@ impl Stages {
 pub fn bar(label: &str, length: u64) -> ProgressBar {
     let style = ProgressStyle::with_template("{prefix:>12} {bar:30} {percent:>3} %  {msg}")
         .unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(length).with_style(style).with_prefix(label.to_owned())
+    ProgressBar::new(length)
+        .with_style(style)
+        .with_prefix(label.to_owned())
 }
 
 #[cfg(test)]
@@ -255,6 +299,11 @@ mod tests {
 
     #[test]
     fn an_address_without_scheme_is_refused() {
-        assert!(Client::new("localhost:8080").unwrap_err().to_string().contains("http://"));
+        assert!(
+            Client::new("localhost:8080")
+                .unwrap_err()
+                .to_string()
+                .contains("http://")
+        );
     }
 }

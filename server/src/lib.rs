@@ -1,4 +1,10 @@
 //! The hydroflex service: coordinator, REST interface, predictions, and the command line around them.
 
+pub mod http;
+pub mod coordinator;
+pub mod prediction;
+pub mod service;
 pub mod client;
 pub mod commands;
+
+pub use http::router as app;

@@ -1,1 +1,15 @@
-//! The worker: begin, simulate, put, commit
+//! The worker: begin, simulate, put, commit.
+//!
+//! - `machines`: machines by reference, reduced once, shared by every shard
+//! - `run`: one run of a job into calls of the simulator, and back into a record
+//! - `shard`: the runs of a shard, encoded
+//! - `shard_loop`: claims and hands in; heartbeat and shutdown around it
+//! - `lifetime`: a worker never outlives the process that started it
+//!
+//! Numbers are made on blocking threads only: the async threads keep the heartbeat going.
+
+pub mod machines;
+pub mod run;
+pub mod shard;
+pub mod shard_loop;
+pub mod lifetime;

@@ -445,6 +445,22 @@ impl Ledger {
         Ok(true)
     }
 
+    /// Gives a training back untouched (a trainer stops): the attempt does not count.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn release_training(&self, claim: &TrainingClaim) -> Result<bool, LedgerError> {
+        let changed = self
+            .pool
+            .execute(
+                "UPDATE trainings SET state = 'open', attempt = attempt - 1, worker = NULL \
+                 WHERE id = $1 AND epoch = $2 AND state = 'running'",
+                values![claim.training.id.to_string(), claim.training.epoch],
+            )
+            .await?;
+        Ok(changed == 1)
+    }
+
     /// True while a training is the trainer's.
     ///
     /// # Errors

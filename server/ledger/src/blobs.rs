@@ -7,6 +7,7 @@
 
 use bytes::Bytes;
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
+use hydroflex_openapi::catalogue::FileEntry;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::{GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
@@ -45,6 +46,14 @@ pub enum BlobError {
         /// Hash recorded.
         expected: String,
     },
+}
+
+impl BlobError {
+    /// True if a put was refused because the object is there.
+    #[must_use]
+    pub fn is_already_there(&self) -> bool {
+        matches!(self, Self::Store(object_store::Error::AlreadyExists { .. }))
+    }
 }
 
 /// A place for objects.
@@ -175,6 +184,39 @@ impl Blobs {
             ..GetOptions::default()
         };
         Ok(self.store.get_opts(&Key::from(key), options).await?.into_stream())
+    }
+
+    /// A local folder with these files of a key: the store itself where it is a directory, else a
+    /// copy, checked, that goes when the second value does.
+    ///
+    /// # Errors
+    /// [`BlobError::Damaged`] if an object is not what was put; what store and file system say.
+    pub async fn folder(
+        &self,
+        key: &str,
+        files: &[FileEntry],
+    ) -> Result<(PathBuf, Option<tempfile::TempDir>), BlobError> {
+        let key = key.trim_end_matches('/');
+        if let Some(path) = self.local_path(key) {
+            return Ok((path, None));
+        }
+        let temporary = tempfile::tempdir().map_err(|source| BlobError::File {
+            path: std::env::temp_dir(),
+            source,
+        })?;
+        for file in files {
+            let path = temporary.path().join(&file.path);
+            let broken = |source| BlobError::File {
+                path: path.clone(),
+                source,
+            };
+            let content = self.read(&format!("{key}/{}", file.path), &file.sha256).await?;
+            if let Some(parent) = path.parent() {
+                tokio::fs::create_dir_all(parent).await.map_err(broken)?;
+            }
+            tokio::fs::write(&path, content).await.map_err(broken)?;
+        }
+        Ok((temporary.path().to_owned(), Some(temporary)))
     }
 
     /// Deletes an object; one that is not there is deleted already.

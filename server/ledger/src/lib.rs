@@ -23,6 +23,7 @@ mod artefacts;
 mod events;
 pub mod blobs;
 pub mod crash;
+pub mod identity;
 pub mod clock;
 
 pub use artefacts::{NewDataset, NewModel, TrainingClaim};

@@ -30,7 +30,11 @@ pub enum Command {
 /// # Errors
 /// If the service cannot be reached or refuses, a file cannot be written, or a hash does not match.
 pub fn run(command: Command) -> anyhow::Result<()> {
-    let Command::Fetch { dataset, out, service } = command;
+    let Command::Fetch {
+        dataset,
+        out,
+        service,
+    } = command;
     let client = Client::new(&service.url)?;
     let info = fetch(&client, &dataset, &out, service.json)?;
     if service.json {
@@ -63,7 +67,13 @@ pub fn fetch(client: &Client, dataset: &str, out: &Path, quiet: bool) -> anyhow:
 ///
 /// # Errors
 /// As [`fetch`].
-pub fn fetch_files(client: &Client, base: &str, files: &[FileEntry], out: &Path, quiet: bool) -> anyhow::Result<()> {
+pub fn fetch_files(
+    client: &Client,
+    base: &str,
+    files: &[FileEntry],
+    out: &Path,
+    quiet: bool,
+) -> anyhow::Result<()> {
     let bar = client::bar("download", files.iter().map(|file| file.size_bytes).sum());
     if quiet {
         bar.set_draw_target(indicatif::ProgressDrawTarget::hidden());
@@ -102,13 +112,18 @@ fn download(client: &Client, path: &str, file: &FileEntry, target: &Path) -> any
         .truncate(!appended)
         .open(&part)
         .with_context(|| format!("cannot write {}", part.display()))?;
-    std::io::copy(&mut response, &mut sink).with_context(|| format!("the download of {path} broke off; call again to go on"))?;
+    std::io::copy(&mut response, &mut sink)
+        .with_context(|| format!("the download of {path} broke off; call again to go on"))?;
     sink.flush()?;
-    sink.sync_all().with_context(|| format!("cannot write {}", part.display()))?;
+    sink.sync_all()
+        .with_context(|| format!("cannot write {}", part.display()))?;
     let found = sha256_of(&part)?;
     if found != file.sha256 {
         std::fs::remove_file(&part).with_context(|| format!("cannot remove {}", part.display()))?;
-        bail!("{path} arrived with SHA-256 {found}, expected {}; it was removed, call again", file.sha256);
+        bail!(
+            "{path} arrived with SHA-256 {found}, expected {}; it was removed, call again",
+            file.sha256
+        );
     }
     std::fs::rename(&part, target).with_context(|| format!("cannot write {}", target.display()))
 }
@@ -116,7 +131,11 @@ fn download(client: &Client, path: &str, file: &FileEntry, target: &Path) -> any
 /// A path below the target directory, whatever a service says.
 fn safe(path: &str) -> anyhow::Result<&Path> {
     let relative = Path::new(path);
-    if path.is_empty() || !relative.components().all(|part| matches!(part, Component::Normal(_))) {
+    if path.is_empty()
+        || !relative
+            .components()
+            .all(|part| matches!(part, Component::Normal(_)))
+    {
         bail!("the service names a file {path:?}, which would lie outside of the directory");
     }
     Ok(relative)
@@ -127,7 +146,9 @@ fn sha256_of(path: &Path) -> anyhow::Result<String> {
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 1 << 16];
     loop {
-        let count = file.read(&mut buffer).with_context(|| format!("cannot read {}", path.display()))?;
+        let count = file
+            .read(&mut buffer)
+            .with_context(|| format!("cannot read {}", path.display()))?;
         if count == 0 {
             return Ok(hex::encode(hash.finalize()));
         }

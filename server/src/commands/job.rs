@@ -87,9 +87,12 @@ pub fn run(command: Command) -> anyhow::Result<()> {
 fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> {
     let mut text = String::new();
     if file == Path::new("-") {
-        std::io::stdin().read_to_string(&mut text).context("cannot read the job from standard input")?;
+        std::io::stdin()
+            .read_to_string(&mut text)
+            .context("cannot read the job from standard input")?;
     } else {
-        text = std::fs::read_to_string(file).with_context(|| format!("cannot read the job {}", file.display()))?;
+        text = std::fs::read_to_string(file)
+            .with_context(|| format!("cannot read the job {}", file.display()))?;
     }
     let client = Client::new(&service.url)?;
     let status: JobStatus = client.post_text("/v1/jobs", text)?;
@@ -105,7 +108,12 @@ fn watch(client: &Client, job: &str, json: bool) -> anyhow::Result<()> {
     if status.state == JobState::Succeeded {
         return Ok(());
     }
-    anyhow::bail!("job {} {}: {}", status.job_id, status.state, status.reason.as_deref().unwrap_or("no reason given"))
+    anyhow::bail!(
+        "job {} {}: {}",
+        status.job_id,
+        status.state,
+        status.reason.as_deref().unwrap_or("no reason given")
+    )
 }
 
 fn list(service: &ServiceArgs) -> anyhow::Result<()> {
@@ -123,7 +131,10 @@ fn list(service: &ServiceArgs) -> anyhow::Result<()> {
     if service.json {
         return super::print_json(&all);
     }
-    super::print_line(format_args!("{:36}  {:10}  {:>16}  created", "job", "state", "runs"))?;
+    super::print_line(format_args!(
+        "{:36}  {:10}  {:>16}  created",
+        "job", "state", "runs"
+    ))?;
     for job in &all {
         super::print_line(format_args!(
             "{}  {:10}  {:>7} / {:<6}  {}",
@@ -160,7 +171,10 @@ fn print(status: &JobStatus, json: bool) -> anyhow::Result<()> {
             (None, Some(reason)) => reason.clone(),
             (None, None) => String::new(),
         };
-        super::print_line(format_args!("training {} {} {outcome}", training.spec.structure, training.state))?;
+        super::print_line(format_args!(
+            "training {} {} {outcome}",
+            training.spec.structure, training.state
+        ))?;
     }
     Ok(())
 }

@@ -11,6 +11,7 @@ pub mod train;
 pub mod evaluate;
 pub mod model;
 pub mod predict;
+mod log;
 
 use anyhow::Context as _;
 use std::io::Write as _;

@@ -35,7 +35,10 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     if service.json {
         return super::print_json(&all);
     }
-    super::print_line(format_args!("{:32}  {:10}  {:32}  created", "model", "structure", "data set"))?;
+    super::print_line(format_args!(
+        "{:32}  {:10}  {:32}  created",
+        "model", "structure", "data set"
+    ))?;
     for model in &all {
         super::print_line(format_args!(
             "{}  {:10}  {}  {}",

@@ -1,15 +1,21 @@
 //! `hydroflex worker`: one worker process.
 
+use crate::service;
+use anyhow::Context;
+use hydroflex_worker::lifetime;
+use hydroflex_worker::shard_loop::{self, Ended, WorkerConfig};
 use std::path::PathBuf;
+use std::time::Duration;
+use tokio::sync::watch;
 
 /// Arguments of `hydroflex worker`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Database URL
-    #[arg(long, env = "HYDROFLEX_DATABASE")]
+    #[arg(long, env = "HYDROFLEX_DATABASE", hide_env_values = true)]
     pub database: String,
     /// Blob store URL
-    #[arg(long, env = "HYDROFLEX_STORE")]
+    #[arg(long, env = "HYDROFLEX_STORE", hide_env_values = true)]
     pub store: String,
     /// Directory for caches (default: a folder of the user's cache directory)
     #[arg(long)]
@@ -20,6 +26,12 @@ pub struct Args {
     /// Finish the shard in hand and stop after this many seconds
     #[arg(long)]
     pub drain_after: Option<u64>,
+    /// Longest time of one run in seconds; a run that takes longer counts as lost
+    #[arg(long, default_value_t = 600)]
+    pub run_limit: u64,
+    /// Simulate runs, or train networks
+    #[arg(long, value_enum, default_value_t = Role::Simulate)]
+    pub role: Role,
     /// Stop when the process with this id has gone
     #[arg(long, hide = true)]
     pub parent: Option<u32>,
@@ -28,10 +40,91 @@ pub struct Args {
     pub json: bool,
 }
 
+/// What a worker does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Role {
+    /// Simulate runs
+    Simulate,
+    /// Train networks
+    Train,
+}
+
 /// Runs the command.
 ///
 /// # Errors
 /// Every failure ends the command with its reason.
-pub fn run(_args: Args) -> anyhow::Result<()> {
-    anyhow::bail!("not wired yet")
+pub fn run(args: Args) -> anyhow::Result<()> {
+    // First of all: from here on this process ends with its parent.
+    if let Some(parent) = args.parent {
+        lifetime::die_with_parent(parent)?;
+        // Ctrl-C reaches the whole group; the parent decides what becomes of us.
+        ignore_interrupt()?;
+    }
+    super::log::start(args.json, if args.parent.is_some() { "warn" } else { "info" });
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()?;
+    let ended = runtime.block_on(work(args));
+    // A hung run cannot be stopped, so the process does not wait for its threads.
+    runtime.shutdown_background();
+    ended
+}
+
+async fn work(args: Args) -> anyhow::Result<()> {
+    let cache = match args.cache {
+        Some(cache) => cache,
+        None => default_cache(),
+    };
+    std::fs::create_dir_all(&cache).with_context(|| format!("cannot make {}", cache.display()))?;
+    let (stop, told) = watch::channel(false);
+    tokio::spawn(async move {
+        if service::until_told_to_stop().await.is_ok() {
+            tracing::info!("draining");
+            stop.send_replace(true);
+        }
+        // Dropping the sender would read as "never stop": keep it.
+        std::future::pending::<()>().await;
+        drop(stop);
+    });
+    match args.role {
+        Role::Simulate => {
+            let config = WorkerConfig {
+                database: args.database,
+                store: args.store,
+                cache,
+                threads: args.threads,
+                drain_after: args.drain_after.map(Duration::from_secs),
+                run_limit: Duration::from_secs(args.run_limit),
+            };
+            match shard_loop::work(config, told).await? {
+                Ended::Drained => Ok(()),
+                Ended::Hung => anyhow::bail!("a run hangs in this process"),
+            }
+        }
+        Role::Train => {
+            anyhow::bail!("not wired yet")
+        }
+    }
+}
+
+fn default_cache() -> PathBuf {
+    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".cache"));
+    std::env::var_os("XDG_CACHE_HOME")
+        .map(PathBuf::from)
+        .or_else(home)
+        .unwrap_or_else(std::env::temp_dir)
+        .join("hydroflex")
+}
+
+fn ignore_interrupt() -> anyhow::Result<()> {
+    // A stream that nobody reads swallows the signal for the life of the process.
+    let runtime = std::thread::Builder::new().name("interrupts".to_owned());
+    runtime.spawn(|| {
+        let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() else {
+            return;
+        };
+        runtime.block_on(async { while tokio::signal::ctrl_c().await.is_ok() {} });
+    })?;
+    Ok(())
 }

@@ -1,6 +1,5 @@
 //! From a finite-element model to a reduced body.
 
-mod cache;
 mod craig_bampton;
 mod damping;
 mod eigen;
@@ -8,7 +7,6 @@ mod factor;
 mod inertia_integrals;
 mod reduced_body;
 
-pub use cache::cached;
 pub use craig_bampton::{FlexibleModel, ModeBasis, clamped_hz, free_free_hz, mode_basis, reduce};
 pub use damping::Damping;
 pub use reduced_body::{ReducedBody, ReducedInterface, ReducedNode, ReductionReport};

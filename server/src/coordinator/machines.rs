@@ -1,0 +1,134 @@
+//! Machines at the front desk: refused before anything runs, with the field at fault.
+
+use hydroflex_dataset::PublishSpec;
+use hydroflex_openapi::catalogue::MachineInfo;
+use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
+use hydroflex_openapi::job::{JobSpec, MachineRef};
+use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
+use hydroflex_openapi::problem::FieldError;
+use hydroflex_sim::machine::Machine;
+use hydroflex_sim::scenario;
+use hydroflex_worker::machines::{Machines, ReadyMachine, RefusedMachine};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Makes machines ready, off the async threads.
+pub struct MachineDesk {
+    machines: Arc<Machines>,
+}
+
+/// A machine that passed every check.
+#[derive(Clone)]
+pub struct CheckedMachine(Arc<ReadyMachine>);
+
+impl MachineDesk {
+    /// Keeps reduced bodies in `cache`, where workers find them.
+    #[must_use]
+    pub fn new(cache: PathBuf) -> Self {
+        Self {
+            machines: Arc::new(Machines::new(cache)),
+        }
+    }
+
+    /// The machine of a job, checked and reduced.
+    ///
+    /// # Errors
+    /// Says what is wrong with it.
+    pub async fn checked(&self, spec: &JobSpec) -> Result<Arc<CheckedMachine>, FieldError> {
+        let (machines, asked) = (self.machines.clone(), spec.clone());
+        let ready = tokio::task::spawn_blocking(move || machines.ready(&asked)).await;
+        match ready {
+            Ok(Ok(ready)) => Ok(Arc::new(CheckedMachine(ready))),
+            Ok(Err(refused)) => Err(refusal(&spec.machine, &refused)),
+            Err(panic) => {
+                tracing::error!(%panic, "a machine made its check panic");
+                Err(FieldError::new("/machine", "this machine cannot be checked"))
+            }
+        }
+    }
+}
+
+fn refusal(reference: &MachineRef, refused: &RefusedMachine) -> FieldError {
+    match (reference, refused) {
+        (_, RefusedMachine::Unknown { name, known }) => {
+            FieldError::new("/machine", "no such machine is built in")
+                .value(name.as_str())
+                .allowed(known.join(", "))
+        }
+        (MachineRef::BuiltIn(name), _) => {
+            FieldError::new("/machine", refused.to_string()).value(name.as_str())
+        }
+        (MachineRef::Inline { .. }, _) => FieldError::new("/machine/toml", refused.to_string()),
+    }
+}
+
+impl CheckedMachine {
+    /// SHA-256 of the machine, hexadecimal.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.0.sha256
+    }
+
+    /// The machine with its simulator.
+    #[must_use]
+    pub fn ready(&self) -> &ReadyMachine {
+        &self.0
+    }
+
+    /// Checks every field of a job against the machine.
+    ///
+    /// # Errors
+    /// The fields at fault.
+    pub fn validate(&self, spec: &JobSpec) -> Result<(), Vec<FieldError>> {
+        scenario::validate(spec, self.0.machine().file())
+    }
+
+    /// What decides the bytes of a job's data set, beside its runs.
+    #[must_use]
+    pub fn publish_spec(&self, spec: JobSpec) -> PublishSpec {
+        let file = self.0.machine().file();
+        let machine = MachineFacts {
+            name: file.name.clone(),
+            toml: self.0.machine().text().to_owned(),
+            content_sha256: self.0.sha256.clone(),
+            angles: file.angles.iter().map(|angle| angle.name.clone()).collect(),
+        };
+        let code = CodeFacts {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            instruction_set: "portable".to_owned(),
+        };
+        PublishSpec::of_job(spec, machine, code, self.0.simulator.channels().to_vec())
+    }
+}
+
+/// The machines that the binary carries.
+#[must_use]
+pub fn built_in() -> Vec<MachineInfo> {
+    Machine::built_in_names()
+        .into_iter()
+        .filter_map(|name| {
+            let toml = Machine::built_in_text(name)?;
+            let file = Machine::parse_file(toml).ok()?;
+            Some(info(name, toml, &file))
+        })
+        .collect()
+}
+
+fn info(name: &str, toml: &str, file: &MachineFile) -> MachineInfo {
+    let has_meshes = file.bodies.iter().all(|body| match body {
+        BodySpec::Flexible(body) => matches!(body.mesh, MeshSource::BuiltIn(_)),
+        BodySpec::Rigid(_) => true,
+    });
+    MachineInfo {
+        name: name.to_owned(),
+        description: file.description.clone(),
+        cylinders: file
+            .cylinders
+            .iter()
+            .map(|cylinder| cylinder.name.clone())
+            .collect(),
+        angles: file.angles.iter().map(|angle| angle.name.clone()).collect(),
+        available: has_meshes,
+        toml: toml.to_owned(),
+    }
+}

@@ -1,0 +1,336 @@
+//! From committed shards to a visible data set.
+//!
+//! ```text
+//! shards in run order ──► scratch directory ──► datasets/ID/… in the store ──► one transaction
+//! ```
+//!
+//! A death anywhere before the transaction leaves nothing that a reader could see; the next attempt
+//! writes the same bytes under the same names.
+
+use super::Coordinator;
+use super::machines::CheckedMachine;
+use hydroflex_dataset::{
+    DirectorySink, PublishError, Published, Publisher, RunKind, RunRecord, ShardError, ShardReader,
+};
+use hydroflex_ledger::blobs::BlobError;
+use hydroflex_ledger::crash::crash_point;
+use hydroflex_ledger::transition::ShardState;
+use hydroflex_ledger::{JobRecord, LedgerError, NewDataset, ShardKind, ShardRecord};
+use hydroflex_openapi::catalogue::FileEntry;
+use hydroflex_openapi::id::{DatasetId, IdError};
+use hydroflex_openapi::problem::FieldError;
+use hydroflex_sim::scenario::ScenarioError;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use tokio::sync::mpsc;
+
+/// Reason in the data set of a run that killed every worker that tried it. The real reasons name
+/// processes and times; they are in the job's events, because a data set holds neither.
+const GIVEN_UP: &str = "given up: every attempt ended with the worker's failure";
+
+/// Shards read ahead of the writer.
+const READ_AHEAD: usize = 4;
+
+/// Why a data set was not published.
+#[derive(Debug, thiserror::Error)]
+pub enum PublishFailure {
+    /// The ledger did not answer.
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
+    /// The store did not answer, or an object is damaged.
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+    /// The machine of the job is refused by this build.
+    #[error("the machine is refused by this build: {}", .0.detail)]
+    Machine(FieldError),
+    /// The machine of the job is not what it was when the job was accepted.
+    #[error("this build's machine has SHA-256 {found}, the job was accepted with {expected}")]
+    OtherMachine {
+        /// As found.
+        found: String,
+        /// As accepted.
+        expected: String,
+    },
+    /// The data set cannot be written.
+    #[error("the data set cannot be written: {0}")]
+    Write(#[from] PublishError),
+    /// A shard cannot be read.
+    #[error("shard {object} cannot be read: {source}")]
+    Shard {
+        /// Object.
+        object: String,
+        /// Cause.
+        source: ShardError,
+    },
+    /// The shards do not cover the runs.
+    #[error("the {kind} shards cover {found} runs, not {expected}")]
+    Uncovered {
+        /// Kind of runs.
+        kind: ShardKind,
+        /// Runs covered.
+        found: u64,
+        /// Runs of the job.
+        expected: u64,
+    },
+    /// A run that was given up cannot be planned.
+    #[error(transparent)]
+    Plan(#[from] ScenarioError),
+    /// The scratch directory fails.
+    #[error("{}: {source}", path.display())]
+    Scratch {
+        /// File or directory.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A hash that is none.
+    #[error(transparent)]
+    Id(#[from] IdError),
+    /// The writer ended without a word.
+    #[error("the writer of the data set panicked: {0}")]
+    Panicked(String),
+}
+
+impl PublishFailure {
+    /// True if another try would fail in the same way.
+    #[must_use]
+    pub fn is_permanent(&self) -> bool {
+        match self {
+            Self::Ledger(error) => !error.is_transient(),
+            Self::Blob(_) | Self::Scratch { .. } => false,
+            // A full disk is a reason to wait, wherever it shows.
+            Self::Write(PublishError::Sink { .. } | PublishError::Parquet { .. }) => false,
+            _ => true,
+        }
+    }
+}
+
+/// What the writer is fed.
+enum Feed {
+    Object { name: String, content: bytes::Bytes },
+    GivenUp { kind: RunKind, run_id: u64 },
+}
+
+/// Publishes the data set of a job whose every run is accounted for.
+///
+/// # Errors
+/// See [`PublishFailure`].
+pub async fn publish(coordinator: &Coordinator, job: &JobRecord) -> Result<(), PublishFailure> {
+    let machine = coordinator
+        .machine(&job.spec)
+        .await
+        .map_err(PublishFailure::Machine)?;
+    if machine.sha256() != job.machine_sha256 {
+        return Err(PublishFailure::OtherMachine {
+            found: machine.sha256().to_owned(),
+            expected: job.machine_sha256.clone(),
+        });
+    }
+    let scratch = Scratch::new(&coordinator.config().scratch, job)?;
+    let published = write(coordinator, job, machine, &scratch.target()).await?;
+    crash_point("publish-written");
+    let id = DatasetId::of_sha256(&published.dataset_sha256)?;
+    let files: Vec<FileEntry> = published
+        .files
+        .iter()
+        .map(|file| FileEntry {
+            path: file.path.clone(),
+            size_bytes: file.bytes,
+            sha256: file.sha256.clone(),
+        })
+        .collect();
+    for (number, file) in files.iter().enumerate() {
+        let key = format!("datasets/{id}/{}", file.path);
+        coordinator
+            .blobs()
+            .upload(&scratch.target().join(&file.path), &key)
+            .await?;
+        if number == 0 {
+            crash_point("publish-upload");
+        }
+    }
+    crash_point("publish-commit");
+    let dataset = NewDataset {
+        id,
+        sha256: published.dataset_sha256,
+        spec: job.spec.clone(),
+        runs: job.spec.runs,
+        files,
+    };
+    let visible = coordinator
+        .ledger()
+        .publish_dataset(job.id, &dataset, &job.spec.train)
+        .await?;
+    crash_point("published");
+    if visible {
+        tracing::info!(job = %job.id, dataset = %dataset.id, "data set published");
+    }
+    Ok(())
+}
+
+/// Reads shards on async threads, writes the data set on a blocking one; a few shards of memory.
+async fn write(
+    coordinator: &Coordinator,
+    job: &JobRecord,
+    machine: Arc<CheckedMachine>,
+    target: &Path,
+) -> Result<Published, PublishFailure> {
+    let (sender, receiver) = mpsc::channel(READ_AHEAD);
+    let (spec, target) = (job.spec.clone(), target.to_owned());
+    let writer = tokio::task::spawn_blocking(move || {
+        let sink = DirectorySink::create(&target).map_err(|source| PublishFailure::Scratch {
+            path: target.clone(),
+            source,
+        })?;
+        let publisher = Publisher::new(machine.publish_spec(spec.clone()), sink)?;
+        let (published, sink) = consume(receiver, publisher, &spec, &machine)?;
+        sink.commit()
+            .map_err(|source| PublishFailure::Scratch { path: target, source })?;
+        Ok(published)
+    });
+    let fed = async {
+        feed(
+            coordinator,
+            job,
+            ShardKind::Settling,
+            job.spec.settling_runs,
+            &sender,
+        )
+        .await?;
+        feed(coordinator, job, ShardKind::Runs, job.spec.runs, &sender).await
+    }
+    .await;
+    let failed_to_feed = match fed {
+        Ok(true) | Err(_) => fed.err(),
+        // The writer hung up: it knows why.
+        Ok(false) => None,
+    };
+    if failed_to_feed.is_none() {
+        drop(sender);
+        return writer
+            .await
+            .map_err(|error| PublishFailure::Panicked(error.to_string()))?;
+    }
+    drop(sender);
+    let _ = writer.await;
+    match failed_to_feed {
+        Some(error) => Err(error),
+        None => Err(PublishFailure::Panicked(
+            "feeding ended without a reason".to_owned(),
+        )),
+    }
+}
+
+/// Sends the shards of one kind in run order. False if the writer hung up.
+async fn feed(
+    coordinator: &Coordinator,
+    job: &JobRecord,
+    kind: ShardKind,
+    expected: u64,
+    sender: &mpsc::Sender<Feed>,
+) -> Result<bool, PublishFailure> {
+    let mut next = 0;
+    loop {
+        let shards = coordinator
+            .ledger()
+            .settled_shards(job.id, kind, next, 64)
+            .await?;
+        for shard in &shards {
+            if shard.first_run != next {
+                break;
+            }
+            let item = fetch(coordinator, shard).await?;
+            if sender.send(item).await.is_err() {
+                return Ok(false);
+            }
+            next += shard.run_count;
+        }
+        if next == expected {
+            return Ok(true);
+        }
+        if shards
+            .last()
+            .is_none_or(|last| last.first_run + last.run_count != next)
+        {
+            return Err(PublishFailure::Uncovered {
+                kind,
+                found: next,
+                expected,
+            });
+        }
+    }
+}
+
+async fn fetch(coordinator: &Coordinator, shard: &ShardRecord) -> Result<Feed, PublishFailure> {
+    match (&shard.object, &shard.sha256) {
+        (Some(object), Some(sha256)) if shard.state == ShardState::Committed => {
+            let content = coordinator.blobs().read(object, sha256).await?;
+            Ok(Feed::Object {
+                name: object.clone(),
+                content,
+            })
+        }
+        _ => {
+            let kind = match shard.kind {
+                ShardKind::Runs => RunKind::Job,
+                ShardKind::Settling => RunKind::Settling,
+            };
+            Ok(Feed::GivenUp {
+                kind,
+                run_id: shard.first_run,
+            })
+        }
+    }
+}
+
+fn consume(
+    mut receiver: mpsc::Receiver<Feed>,
+    mut publisher: Publisher<DirectorySink>,
+    spec: &hydroflex_openapi::job::JobSpec,
+    machine: &CheckedMachine,
+) -> Result<(Published, DirectorySink), PublishFailure> {
+    while let Some(item) = receiver.blocking_recv() {
+        match item {
+            Feed::Object { name, content } => {
+                let unreadable = |source| PublishFailure::Shard {
+                    object: name.clone(),
+                    source,
+                };
+                for record in ShardReader::open(Cursor::new(content)).map_err(unreadable)? {
+                    let record: RunRecord = record.map_err(unreadable)?;
+                    publisher.push(&record)?;
+                }
+            }
+            Feed::GivenUp { kind, run_id } => {
+                let planned = hydroflex_worker::run::plan(spec, machine.ready(), kind, run_id)?;
+                publisher.push(&planned.failed(GIVEN_UP.to_owned()))?;
+            }
+        }
+    }
+    Ok(publisher.finish()?)
+}
+
+/// A directory of its own for one attempt; gone when the attempt is.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(root: &Path, job: &JobRecord) -> Result<Self, PublishFailure> {
+        let path = root.join(format!("{}-{}", job.id, uuid::Uuid::now_v7()));
+        std::fs::create_dir_all(&path).map_err(|source| PublishFailure::Scratch {
+            path: path.clone(),
+            source,
+        })?;
+        Ok(Self(path))
+    }
+
+    fn target(&self) -> PathBuf {
+        self.0.join("dataset")
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}

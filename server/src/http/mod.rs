@@ -1,0 +1,175 @@
+//! The REST interface: one file per resource, one map from errors to statuses.
+//!
+//! Deliberately absent: any request field that names a path or a URL which the service would read.
+
+pub mod error;
+pub mod extract;
+pub mod jobs;
+pub mod events;
+pub mod datasets;
+pub mod files;
+pub mod archive;
+pub mod trainings;
+pub mod models;
+pub mod machines;
+pub mod operations;
+
+use crate::coordinator::Coordinator;
+use crate::prediction::ModelRegistry;
+use axum::Router;
+use axum::extract::{DefaultBodyLimit, Request};
+use axum::http::{Method, Uri};
+use axum::response::{IntoResponse, Redirect, Response};
+use error::ApiError;
+use hydroflex_ledger::Ledger;
+use hydroflex_ledger::blobs::Blobs;
+use std::sync::Arc;
+use tower_http::catch_panic::CatchPanicLayer;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+use utoipa_swagger_ui::SwaggerUi;
+
+/// What every handler may use.
+#[derive(Clone)]
+pub struct AppState {
+    coordinator: Coordinator,
+    models: Arc<ModelRegistry>,
+}
+
+impl AppState {
+    /// The state of a service around a coordinator.
+    #[must_use]
+    pub fn new(coordinator: Coordinator) -> Self {
+        Self {
+            coordinator,
+            models: Arc::default(),
+        }
+    }
+
+    /// The coordinator.
+    #[must_use]
+    pub fn coordinator(&self) -> &Coordinator {
+        &self.coordinator
+    }
+
+    /// The ledger.
+    #[must_use]
+    pub fn ledger(&self) -> &Ledger {
+        self.coordinator.ledger()
+    }
+
+    /// The store.
+    #[must_use]
+    pub fn blobs(&self) -> &Blobs {
+        self.coordinator.blobs()
+    }
+
+    /// Models in memory.
+    #[must_use]
+    pub fn models(&self) -> &ModelRegistry {
+        &self.models
+    }
+}
+
+/// Head of the published document.
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "hydroflex",
+        description = "Simulate hydraulically driven flexible booms, train SLIDE networks, estimate \
+            deflection, strain and stress.\n\nUnits are the last part of every name. Errors are \
+            `application/problem+json` and say which field, what value, what is allowed.",
+    ),
+    tags(
+        (name = "jobs", description = "Batches of random runs, and the networks trained on them"),
+        (name = "data sets", description = "Published trajectories, immutable, addressed by content"),
+        (name = "trainings", description = "Networks for published data sets"),
+        (name = "models", description = "Trained networks and their estimates"),
+        (name = "machines", description = "What can be simulated"),
+        (name = "operations", description = "For whoever runs the service"),
+    ),
+)]
+struct Document;
+
+fn routes() -> OpenApiRouter<AppState> {
+    OpenApiRouter::with_openapi(Document::openapi())
+        .routes(routes!(jobs::submit, jobs::list))
+        .routes(routes!(jobs::show))
+        .routes(routes!(jobs::cancel))
+        .routes(routes!(events::follow))
+        .routes(routes!(datasets::list))
+        .routes(routes!(datasets::show))
+        .routes(routes!(datasets::archive))
+        .routes(routes!(trainings::submit))
+        .routes(routes!(trainings::show))
+        .routes(routes!(models::list))
+        .routes(routes!(models::show))
+        .routes(routes!(models::predict))
+        .routes(routes!(machines::list))
+        .routes(routes!(machines::show))
+        .routes(routes!(operations::live))
+        .routes(routes!(operations::ready))
+        .routes(routes!(operations::metrics))
+}
+
+/// Handlers whose path holds slashes: axum writes `{*path}`, OpenAPI has no word for it.
+fn file_routes() -> Router<AppState> {
+    Router::new()
+        .route(
+            "/v1/datasets/{dataset_id}/files/{*path}",
+            axum::routing::get(datasets::file),
+        )
+        .route(
+            "/v1/models/{model_id}/files/{*path}",
+            axum::routing::get(models::file),
+        )
+}
+
+/// Document of the two handlers of [`file_routes`].
+#[derive(OpenApi)]
+#[openapi(paths(datasets::file, models::file))]
+struct FileDocument;
+
+/// The published document.
+#[must_use]
+pub fn openapi() -> utoipa::openapi::OpenApi {
+    let (_, mut document) = routes().split_for_parts();
+    document.merge(FileDocument::openapi());
+    document
+}
+
+/// The whole service as one function.
+pub fn router(state: AppState) -> Router {
+    let (router, _) = routes().split_for_parts();
+    router
+        .merge(file_routes())
+        .with_state(state)
+        .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi()))
+        .route(
+            "/",
+            axum::routing::get(|| async { Redirect::temporary("/docs/") }),
+        )
+        .fallback(unknown_path)
+        .method_not_allowed_fallback(unknown_method)
+        .layer(DefaultBodyLimit::max(extract::BODY_LIMIT_BYTES))
+        .layer(CatchPanicLayer::custom(panicked))
+        .layer(axum::middleware::from_fn(operations::measure))
+}
+
+async fn unknown_path(uri: Uri) -> ApiError {
+    ApiError::NotFound(format!("nothing is at {}", uri.path()))
+}
+
+async fn unknown_method(method: Method, request: Request) -> ApiError {
+    ApiError::MethodNotAllowed(format!("{method} is not done at {}", request.uri().path()))
+}
+
+fn panicked(cause: Box<dyn std::any::Any + Send>) -> Response {
+    let text = cause
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| cause.downcast_ref::<&str>().copied())
+        .unwrap_or("a panic without a message");
+    ApiError::Internal(format!("panic: {text}")).into_response()
+}

@@ -1,0 +1,130 @@
+//! `/v1/models`: list, show, download, predict.
+
+use super::AppState;
+use super::error::ApiError;
+use super::extract::{Id, IdAndFile, JsonBody, Page, PageQuery, TimeCursor};
+use super::files;
+use axum::Json;
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{HeaderMap, Method, Response};
+use hydroflex_ledger::{Ledger, ModelRecord};
+use hydroflex_openapi::catalogue::{ModelInfo, ModelPage};
+use hydroflex_openapi::id::ModelId;
+use hydroflex_openapi::prediction::{PredictRequest, PredictResponse};
+use hydroflex_openapi::problem::Problem;
+
+/// List models with their metrics, newest first
+#[utoipa::path(
+    get, path = "/v1/models", tag = "models", operation_id = "list_models", params(PageQuery),
+    responses(
+        (status = 200, description = "A page of models", body = ModelPage),
+        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub async fn list(State(state): State<AppState>, page: Page) -> Result<Json<ModelPage>, ApiError> {
+    let after: Option<TimeCursor> = page.after()?;
+    let before = after.as_ref().map(|cursor| (cursor.ms, cursor.id.as_str()));
+    let mut records = state.ledger().models(before, page.limit + 1).await?;
+    let more = records.len() as u64 > page.limit;
+    records.truncate(usize::try_from(page.limit).unwrap_or(usize::MAX));
+    let next_cursor = records.last().filter(|_| more).map(|last| {
+        TimeCursor {
+            ms: last.created_ms,
+            id: last.id.to_string(),
+        }
+        .to_string()
+    });
+    Ok(Json(ModelPage {
+        models: records.iter().map(ModelRecord::info).collect(),
+        next_cursor,
+    }))
+}
+
+/// Show a model
+#[utoipa::path(
+    get, path = "/v1/models/{model_id}", tag = "models", operation_id = "show_model",
+    params(("model_id" = ModelId, Path)),
+    responses(
+        (status = 200, description = "The model", body = ModelInfo),
+        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub async fn show(State(state): State<AppState>, Id(id): Id<ModelId>) -> Result<Json<ModelInfo>, ApiError> {
+    Ok(Json(find(state.ledger(), &id).await?.info()))
+}
+
+/// Download one file of a model
+#[utoipa::path(
+    get, path = "/v1/models/{model_id}/files/{path}", tag = "models", operation_id = "download_model_file",
+    params(
+        ("model_id" = ModelId, Path),
+        ("path" = String, Path, description = "As listed, for example `model.safetensors`"),
+        ("Range" = Option<String>, Header, description = "One range of bytes"),
+    ),
+    responses(
+        (status = 200, description = "The file", body = Vec<u8>, content_type = "application/octet-stream"),
+        (status = 206, description = "The range", body = Vec<u8>, content_type = "application/octet-stream"),
+        (status = 304, description = "The file is as the ETag says"),
+        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub async fn file(
+    State(state): State<AppState>,
+    IdAndFile(id, path): IdAndFile<ModelId>,
+    method: Method,
+    headers: HeaderMap,
+) -> Result<Response<Body>, ApiError> {
+    let model = find(state.ledger(), &id).await?;
+    let entry = model
+        .file(&path)
+        .ok_or_else(|| ApiError::NotFound(format!("model {id} has no file {path:?}")))?;
+    files::serve(
+        state.blobs(),
+        &model.key(&entry.path),
+        entry,
+        &headers,
+        method == Method::HEAD,
+    )
+    .await
+}
+
+/// Estimate deflection, strain and stress from sensor signals
+///
+/// `inputs` holds every input of the model by column name; a number stands for a constant signal.
+#[utoipa::path(
+    post, path = "/v1/models/{model_id}/predict", tag = "models", operation_id = "predict",
+    params(("model_id" = ModelId, Path)), request_body = PredictRequest,
+    responses(
+        (status = 200, description = "Estimates", body = PredictResponse),
+        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub async fn predict(
+    State(state): State<AppState>,
+    Id(id): Id<ModelId>,
+    body: JsonBody<PredictRequest>,
+) -> Result<Json<PredictResponse>, ApiError> {
+    let model = match state.models().loaded(&id) {
+        Some(model) => model,
+        None => {
+            state
+                .models()
+                .load(&find(state.ledger(), &id).await?, state.blobs())
+                .await?
+        }
+    };
+    // A long recording takes a while: not on the threads that answer everybody.
+    let answer = tokio::task::spawn_blocking(move || model.predict(&body.value)).await;
+    answer
+        .map_err(|error| ApiError::Internal(error.to_string()))?
+        .map(Json)
+        .map_err(ApiError::Invalid)
+}
+
+async fn find(ledger: &Ledger, id: &ModelId) -> Result<ModelRecord, ApiError> {
+    ledger
+        .model(id)
+        .await?
+        .ok_or_else(|| ApiError::NotFound(format!("no model {id}")))
+}

@@ -1,0 +1,95 @@
+//! One run of a job: from its index to a record.
+
+use crate::machines::ReadyMachine;
+use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
+use hydroflex_openapi::job::JobSpec;
+use hydroflex_sim::scenario::{self, ScenarioError};
+use hydroflex_sim::trajectory::{RunInput, RunSettings};
+
+/// The run as planned, with the record that it will get if it leaves no samples.
+pub struct PlannedRun {
+    /// What the simulator is asked.
+    pub input: RunInput,
+    seed: u64,
+    kind: RunKind,
+}
+
+/// Plans run `index` of a job.
+///
+/// # Errors
+/// Only for jobs that were never checked.
+pub fn plan(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    index: u64,
+) -> Result<PlannedRun, ScenarioError> {
+    let file = machine.machine().file();
+    let (input, seed) = match kind {
+        RunKind::Job => (
+            scenario::plan_run(spec, file, index)?,
+            scenario::run_seed(spec.seed, index),
+        ),
+        RunKind::Settling => (
+            scenario::plan_settling_run(spec, file, index)?,
+            scenario::settling_run_seed(spec.seed, index),
+        ),
+    };
+    Ok(PlannedRun { input, seed, kind })
+}
+
+impl PlannedRun {
+    /// Simulates. A run that does not converge, or turns non-finite, is data; a panic is not, and
+    /// goes through to whoever counts attempts.
+    #[must_use]
+    pub fn simulate(self, spec: &JobSpec, machine: &ReadyMachine) -> RunRecord {
+        let settings = RunSettings {
+            integrator: spec.integrator,
+            sample_time_s: spec.sample_time_s,
+        };
+        match machine.simulator.run(&self.input, &settings) {
+            Ok(trajectory) => {
+                let statistics = RunStatistics {
+                    steps: trajectory.statistics.steps,
+                    rejected: trajectory.statistics.rejected,
+                    iterations: trajectory.statistics.iterations,
+                    factorisations: trajectory.statistics.factorisations,
+                };
+                let samples = RunSamples {
+                    sample_count: trajectory.sample_count,
+                    columns: trajectory.columns,
+                };
+                self.record(RunOutcome::Ok(samples), trajectory.flags, statistics)
+            }
+            Err(failure) => self.failed(failure.to_string()),
+        }
+    }
+
+    /// The record of a run without samples.
+    #[must_use]
+    pub fn failed(self, reason: String) -> RunRecord {
+        self.record(
+            RunOutcome::Failed { reason },
+            Vec::new(),
+            RunStatistics::default(),
+        )
+    }
+
+    fn record(
+        self,
+        outcome: RunOutcome,
+        flags: Vec<hydroflex_openapi::job::RunFlag>,
+        statistics: RunStatistics,
+    ) -> RunRecord {
+        RunRecord {
+            kind: self.kind,
+            run_id: self.input.run_id,
+            seed: Some(self.seed),
+            payload_kg: self.input.payload_kg,
+            angles_rad: self.input.angles_rad,
+            outcome,
+            flags,
+            statistics,
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The runs of a shard, simulated and encoded.
+
+use crate::machines::ReadyMachine;
+use crate::run;
+use bytes::Bytes;
+use hydroflex_dataset::{RunKind, RunRecord, ShardError, ShardSchema, ShardWriter};
+use hydroflex_ledger::{Claim, ShardKind};
+use hydroflex_openapi::job::{JobSpec, RunStatus};
+use hydroflex_openapi::status::TimeSplit;
+use hydroflex_sim::scenario::ScenarioError;
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Instant;
+
+/// Runs simulated before their records are encoded, per thread: bounds the memory of a shard of
+/// thousands of runs.
+const BATCH_PER_THREAD: usize = 16;
+
+/// A shard ready to be put.
+#[derive(Debug, Clone)]
+pub struct EncodedShard {
+    /// Content of the object.
+    pub content: Bytes,
+    /// Its SHA-256.
+    pub sha256: String,
+    /// Runs without samples.
+    pub failed_runs: u64,
+    /// Time spent; `put_s` still to come.
+    pub spent: TimeSplit,
+}
+
+/// Why a shard was not finished.
+#[derive(Debug, thiserror::Error)]
+pub enum ShardFailure {
+    /// Told to stop; nothing is wrong with the shard.
+    #[error("told to stop")]
+    Stopped,
+    /// A run panicked: a fault of ours that another attempt, or its halves, will narrow down.
+    #[error("run {run_id} panicked: {message}")]
+    Panicked {
+        /// Run.
+        run_id: u64,
+        /// Text of the panic.
+        message: String,
+    },
+    /// A run cannot be planned: the job was never checked.
+    #[error("run {run_id} cannot be planned: {source}")]
+    Plan {
+        /// Run.
+        run_id: u64,
+        /// Cause.
+        source: ScenarioError,
+    },
+    /// Encoding failed.
+    #[error("the shard cannot be encoded: {0}")]
+    Encode(#[from] ShardError),
+}
+
+/// What others may see of a shard in work, and say to it.
+#[derive(Debug, Default)]
+pub struct ShardControl {
+    /// Set to stop before the next run.
+    pub stop: AtomicBool,
+    /// Runs done: a number that stands still means a run that hangs.
+    pub runs_done: AtomicU64,
+}
+
+/// Simulates and encodes the runs of a claim, on the threads of `pool`. The bytes do not depend on
+/// their number.
+///
+/// # Errors
+/// See [`ShardFailure`].
+pub fn make(
+    claim: &Claim,
+    machine: &ReadyMachine,
+    pool: &rayon::ThreadPool,
+    control: &ShardControl,
+) -> Result<EncodedShard, ShardFailure> {
+    let spec = &claim.job.spec;
+    let kind = match claim.shard.kind {
+        ShardKind::Runs => RunKind::Job,
+        ShardKind::Settling => RunKind::Settling,
+    };
+    let schema = ShardSchema {
+        channels: machine
+            .simulator
+            .channels()
+            .iter()
+            .map(|channel| channel.name.clone())
+            .collect(),
+        angles: machine
+            .machine()
+            .file()
+            .angles
+            .iter()
+            .map(|angle| angle.name.clone())
+            .collect(),
+        sample_type: spec.sample_type,
+    };
+    let mut spent = TimeSplit::default();
+    let mut failed_runs = 0;
+    let mut writer = ShardWriter::new(schema, Vec::new())?;
+    let runs: Vec<u64> = (claim.shard.first_run..)
+        .take(usize::try_from(claim.shard.run_count).unwrap_or(0))
+        .collect();
+    for batch in runs.chunks(BATCH_PER_THREAD * pool.current_num_threads()) {
+        let start = Instant::now();
+        let records = pool.install(|| {
+            batch
+                .par_iter()
+                .map(|index| simulate(spec, machine, kind, *index, control))
+                .collect::<Result<Vec<RunRecord>, ShardFailure>>()
+        })?;
+        // Of one thread: what the shard would have cost alone.
+        spent.simulate_s +=
+            start.elapsed().as_secs_f64() * pool.current_num_threads().min(batch.len()) as f64;
+        let start = Instant::now();
+        for record in &records {
+            failed_runs += u64::from(record.status() == RunStatus::Failed);
+            writer.push(record)?;
+        }
+        spent.encode_s += start.elapsed().as_secs_f64();
+    }
+    let start = Instant::now();
+    let content = Bytes::from(writer.finish()?);
+    let sha256 = hex::encode(Sha256::digest(&content));
+    spent.encode_s += start.elapsed().as_secs_f64();
+    Ok(EncodedShard {
+        content,
+        sha256,
+        failed_runs,
+        spent,
+    })
+}
+
+fn simulate(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    index: u64,
+    control: &ShardControl,
+) -> Result<RunRecord, ShardFailure> {
+    if control.stop.load(Ordering::Relaxed) {
+        return Err(ShardFailure::Stopped);
+    }
+    let planned = run::plan(spec, machine, kind, index).map_err(|source| ShardFailure::Plan {
+        run_id: index,
+        source,
+    })?;
+    let record = catch_unwind(AssertUnwindSafe(|| planned.simulate(spec, machine)));
+    control.runs_done.fetch_add(1, Ordering::Relaxed);
+    record.map_err(|cause| {
+        let message = cause
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| cause.downcast_ref::<&str>().copied())
+            .unwrap_or("no message");
+        ShardFailure::Panicked {
+            run_id: index,
+            message: message.chars().take(400).collect(),
+        }
+    })
+}
