@@ -13,6 +13,7 @@ pub mod equilibrium;
 pub mod trajectory;
 mod general;
 pub mod simulator;
+pub mod summary;
 
 #[cfg(test)]
 pub(crate) mod testing;

@@ -1,0 +1,338 @@
+//! What there is to know about a machine before it moves: for `hydroflex machine show`.
+
+use crate::fe::{assemble_mass, assemble_stiffness};
+use crate::machine::FlexibleBody;
+use crate::reduction::{ReducedBody, ReductionError, free_free_hz};
+use crate::simulator::{Simulator, SimulatorError};
+use hydroflex_openapi::machine::{BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, PayloadSpec};
+use nalgebra::{DMatrix, Matrix3, Vector3};
+use serde::Serialize;
+
+/// Points over the range of angles at which the equilibrium is shown.
+const EQUILIBRIUM_POINTS: usize = 7;
+
+/// Free-free frequencies shown.
+const FREE_FREE_COUNT: usize = 6;
+
+/// Why a machine cannot be summarised.
+#[derive(Debug, thiserror::Error)]
+pub enum SummaryError {
+    /// A body cannot be reduced.
+    #[error(transparent)]
+    Reduction(#[from] ReductionError),
+    /// The simulator cannot be built.
+    #[error(transparent)]
+    Simulator(#[from] SimulatorError),
+}
+
+/// A machine in numbers.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MachineSummary {
+    /// Name.
+    pub name: String,
+    /// Description.
+    pub description: String,
+    /// Content hash of description, meshes and code, hexadecimal.
+    pub content_hash: String,
+    /// Bodies in the file's order.
+    pub bodies: Vec<BodySummary>,
+    /// Names of the angles, as the rows of `equilibria` give them.
+    pub angle_names: Vec<String>,
+    /// Names of the cylinders, as the rows of `equilibria` give them.
+    pub cylinder_names: Vec<String>,
+    /// Equilibria over the range of angles, for payloads from none to the largest.
+    pub equilibria: Vec<EquilibriumRow>,
+}
+
+/// A body in numbers; body frame.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BodySummary {
+    /// Name.
+    pub name: String,
+    /// Mass.
+    pub mass_kg: f64,
+    /// Centre of mass.
+    pub centre_of_mass_m: [f64; 3],
+    /// Inertia about the centre of mass, by rows.
+    pub inertia_kg_m2: [[f64; 3]; 3],
+    /// What only a flexible body has.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flexible: Option<FlexibleSummary>,
+}
+
+/// The flexible side of a body.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FlexibleSummary {
+    /// Material.
+    pub material: String,
+    /// Element type.
+    pub element_kind: String,
+    /// Mesh nodes.
+    pub node_count: usize,
+    /// Mesh elements.
+    pub element_count: usize,
+    /// Interfaces in the file's order.
+    pub interfaces: Vec<InterfaceSummary>,
+    /// First elastic frequencies of the free body, full model.
+    pub free_free_hz: Vec<f64>,
+    /// The mode bases: without payload, and with it where that makes a difference.
+    pub bases: Vec<BasisSummary>,
+}
+
+/// An interface.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InterfaceSummary {
+    /// Name.
+    pub name: String,
+    /// Nodes.
+    pub node_count: usize,
+    /// Marker point.
+    pub position_m: [f64; 3],
+    /// When it is a boundary of the basis: `always`, `with_payload` or `never`.
+    pub boundary: String,
+}
+
+/// A mode basis.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BasisSummary {
+    /// Whether it is that of runs with payload.
+    pub with_payload: bool,
+    /// Boundary interfaces; the first carries the frame.
+    pub boundaries: Vec<String>,
+    /// Modes.
+    pub mode_count: usize,
+    /// Clamped-interface frequencies of the normal modes.
+    pub fixed_interface_hz: Vec<f64>,
+    /// Frequencies of the reduced body with its first interface clamped.
+    pub reduced_hz: Vec<f64>,
+}
+
+/// A configuration at rest.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EquilibriumRow {
+    /// Payload.
+    pub payload_kg: f64,
+    /// Angles as a run table gives them.
+    pub angles_deg: Vec<f64>,
+    /// Eye-to-eye lengths of the cylinders.
+    pub lengths_m: Vec<f64>,
+    /// Forces of the oil, tension positive.
+    pub forces_n: Vec<f64>,
+    /// Pressures on the piston side.
+    pub pressures_piston_pa: Vec<f64>,
+    /// Pressures on the rod side.
+    pub pressures_rod_pa: Vec<f64>,
+    /// Whether every pressure lies between tank and supply.
+    pub within_supply: bool,
+    /// Why there is no equilibrium here.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
+}
+
+/// Summarises a machine: reduces its bodies and solves its equilibria.
+///
+/// # Errors
+/// If a body cannot be reduced.
+pub fn summarise(simulator: &Simulator) -> Result<MachineSummary, SummaryError> {
+    let machine = simulator.machine();
+    let file = machine.file();
+    let mut flexible = machine.flexible_bodies().iter().enumerate();
+    let mut bodies = Vec::new();
+    for body in &file.bodies {
+        bodies.push(match body {
+            BodySpec::Rigid(body) => {
+                let [xx, yy, zz, xy, xz, yz] = body.inertia_kg_m2;
+                BodySummary {
+                    name: body.name.clone(),
+                    mass_kg: body.mass_kg,
+                    centre_of_mass_m: body.centre_of_mass_m,
+                    inertia_kg_m2: [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]],
+                    flexible: None,
+                }
+            }
+            BodySpec::Flexible(spec) => {
+                let Some((i, body)) = flexible.next() else {
+                    continue;
+                };
+                flexible_summary(simulator, i, spec, body)?
+            }
+        });
+    }
+    Ok(MachineSummary {
+        name: file.name.clone(),
+        description: file.description.clone(),
+        content_hash: hex::encode(machine.content_hash()),
+        bodies,
+        angle_names: file.angles.iter().map(|a| a.name.clone()).collect(),
+        cylinder_names: file.cylinders.iter().map(|c| c.name.clone()).collect(),
+        equilibria: equilibria(simulator),
+    })
+}
+
+fn flexible_summary(
+    simulator: &Simulator,
+    index: usize,
+    spec: &FlexibleBodySpec,
+    body: &FlexibleBody,
+) -> Result<BodySummary, SummaryError> {
+    let without = &simulator.reduced(false)?[index];
+    let mut bases = vec![basis(without, false)];
+    if body.boundary_with_payload != body.boundary_without_payload {
+        bases.push(basis(&simulator.reduced(true)?[index], true));
+    }
+    let stiffness = assemble_stiffness(&body.mesh, &body.material);
+    let mass = assemble_mass(&body.mesh, &body.material, body.mass_kind);
+    // the free body's first bending lies a few times above the clamped one
+    let scale_hz = 3.0 * without.report.fixed_interface_hz.first().unwrap_or(&30.0);
+    let com = without.centre_of_mass_m;
+    let about_origin = without.inertia_origin_kg_m2;
+    let steiner = Matrix3::from_diagonal_element(com.norm_squared()) - com * com.transpose();
+    let inertia = about_origin - steiner * without.mass_kg;
+    Ok(BodySummary {
+        name: body.name.clone(),
+        mass_kg: without.mass_kg,
+        centre_of_mass_m: com.into(),
+        inertia_kg_m2: std::array::from_fn(|r| std::array::from_fn(|c| inertia[(r, c)])),
+        flexible: Some(FlexibleSummary {
+            material: spec.material.name.clone(),
+            element_kind: body.mesh.elements().kind_name().to_owned(),
+            node_count: body.mesh.node_count(),
+            element_count: body.mesh.elements().len(),
+            interfaces: spec
+                .interfaces
+                .iter()
+                .zip(&body.interfaces)
+                .map(|(spec, nodes)| InterfaceSummary {
+                    name: spec.name.clone(),
+                    node_count: nodes.nodes.len(),
+                    position_m: Vector3::into(nodes.weighted_mean_m(&body.mesh)),
+                    boundary: match spec.boundary {
+                        Boundary::Always => "always",
+                        Boundary::WithPayload => "with_payload",
+                        Boundary::Never => "never",
+                    }
+                    .to_owned(),
+                })
+                .collect(),
+            free_free_hz: free_free_hz(&stiffness, &mass, scale_hz, FREE_FREE_COUNT)?,
+            bases,
+        }),
+    })
+}
+
+fn basis(body: &ReducedBody, with_payload: bool) -> BasisSummary {
+    BasisSummary {
+        with_payload,
+        boundaries: body.report.boundary_names.clone(),
+        mode_count: body.mode_count(),
+        fixed_interface_hz: body.report.fixed_interface_hz.clone(),
+        reduced_hz: generalised_hz(&body.stiffness_modal, &body.mass_modal),
+    }
+}
+
+/// Frequencies of `K v = ω² M v`, ascending, Hz; empty if M is not positive definite.
+fn generalised_hz(stiffness: &DMatrix<f64>, mass: &DMatrix<f64>) -> Vec<f64> {
+    let solve = || {
+        let l = mass.clone().cholesky()?.l();
+        let half = l.solve_lower_triangular(stiffness)?;
+        let c = l.solve_lower_triangular(&half.transpose())?;
+        Some(((&c + c.transpose()) * 0.5).symmetric_eigenvalues())
+    };
+    let mut hz: Vec<f64> = solve().map_or_else(Vec::new, |w2| {
+        w2.iter()
+            .map(|w2| w2.max(0.0).sqrt() / (2.0 * std::f64::consts::PI))
+            .collect()
+    });
+    hz.sort_by(f64::total_cmp);
+    hz
+}
+
+fn equilibria(simulator: &Simulator) -> Vec<EquilibriumRow> {
+    let file = simulator.machine().file();
+    let payloads = match &file.payload {
+        Some(PayloadSpec { range_kg, .. }) => {
+            vec![range_kg[0], 0.5 * (range_kg[0] + range_kg[1]), range_kg[1]]
+        }
+        None => vec![0.0],
+    };
+    let mut rows = Vec::new();
+    for payload_kg in payloads {
+        for point in 0..EQUILIBRIUM_POINTS {
+            let part = point as f64 / (EQUILIBRIUM_POINTS - 1) as f64;
+            let angles_deg: Vec<f64> = file
+                .angles
+                .iter()
+                .map(|a| a.range_deg[0] + part * (a.range_deg[1] - a.range_deg[0]))
+                .collect();
+            rows.push(equilibrium_row(simulator, payload_kg, angles_deg));
+        }
+    }
+    rows
+}
+
+fn equilibrium_row(simulator: &Simulator, payload_kg: f64, angles_deg: Vec<f64>) -> EquilibriumRow {
+    let cylinders = &simulator.machine().file().cylinders;
+    let angles_rad: Vec<f64> = angles_deg.iter().map(|a| a.to_radians()).collect();
+    match simulator.equilibrium(payload_kg, &angles_rad) {
+        Ok(rest) => EquilibriumRow {
+            payload_kg,
+            angles_deg,
+            lengths_m: rest.lengths_m,
+            forces_n: cylinders
+                .iter()
+                .zip(&rest.pressures_pa)
+                .map(|(c, p)| oil_force_n(c, *p))
+                .collect(),
+            pressures_piston_pa: rest.pressures_pa.iter().map(|p| p[0]).collect(),
+            pressures_rod_pa: rest.pressures_pa.iter().map(|p| p[1]).collect(),
+            within_supply: cylinders.iter().zip(&rest.pressures_pa).all(|(c, p)| {
+                let range = c.valve.tank_pressure_pa..=c.valve.supply_pressure_pa;
+                p.iter().all(|p| range.contains(p))
+            }),
+            failure: None,
+        },
+        Err(error) => EquilibriumRow {
+            payload_kg,
+            angles_deg,
+            lengths_m: Vec::new(),
+            forces_n: Vec::new(),
+            pressures_piston_pa: Vec::new(),
+            pressures_rod_pa: Vec::new(),
+            within_supply: false,
+            failure: Some(error.to_string()),
+        },
+    }
+}
+
+/// `−p₀ A₀ + p₁ A₁`, tension positive, N.
+fn oil_force_n(cylinder: &CylinderSpec, [piston_pa, rod_pa]: [f64; 2]) -> f64 {
+    let disc = |diameter_m: f64| 0.25 * std::f64::consts::PI * diameter_m * diameter_m;
+    let piston_m2 = disc(cylinder.piston_diameter_m);
+    let ring_m2 = piston_m2 - disc(cylinder.rod_diameter_m);
+    rod_pa * ring_m2 - piston_pa * piston_m2
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::machine::Machine;
+
+    #[test]
+    fn the_built_in_boom_rests_within_its_supply_over_the_whole_range() {
+        let machine = Machine::load("lift-boom", &[]).unwrap();
+        let simulator = Simulator::new(machine).unwrap();
+        let rows = equilibria(&simulator);
+        assert_eq!(rows.len(), 3 * EQUILIBRIUM_POINTS);
+        for row in &rows {
+            assert_eq!(row.failure, None);
+            assert!(row.within_supply, "{row:?}");
+            let (shortest, longest) = (0.820, 0.820 + 0.535);
+            assert!((shortest..longest).contains(&row.lengths_m[0]), "{row:?}");
+        }
+        // more payload, more pressure
+        let piston = |row: &EquilibriumRow| row.pressures_piston_pa[0];
+        for (light, heavy) in rows.iter().zip(&rows[EQUILIBRIUM_POINTS..]) {
+            assert!(piston(heavy) > piston(light));
+        }
+    }
+}
