@@ -118,6 +118,14 @@ pub enum Problem {
         /// What was found and what is allowed, in the parser's words.
         message: String,
     },
+    /// A list of the wrong length.
+    #[error("{found} numbers where {wanted} are needed")]
+    ListLength {
+        /// Found.
+        found: usize,
+        /// Needed.
+        wanted: usize,
+    },
     /// A format version that this build does not read.
     #[error("format {found} is not read; this build reads format {supported}")]
     Format {
@@ -127,7 +135,7 @@ pub enum Problem {
         supported: u32,
     },
     /// A number out of its range.
-    #[error("{value} is outside the allowed range {low} to {high} {unit}")]
+    #[error("{} is outside the allowed range {} to {} {unit}", short(*value), short(*low), short(*high))]
     OutOfRange {
         /// Value.
         value: f64,
@@ -317,4 +325,13 @@ pub enum Problem {
         /// Body.
         body: String,
     },
+}
+
+/// A number as a person would write it: powers of ten where there would be many zeros.
+fn short(x: f64) -> String {
+    if x == 0.0 || (1e-3..1e5).contains(&x.abs()) || !x.is_finite() {
+        x.to_string()
+    } else {
+        format!("{x:e}")
+    }
 }
