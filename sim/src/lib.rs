@@ -10,6 +10,7 @@ pub mod force;
 pub mod system;
 pub mod integrate;
 pub mod equilibrium;
+pub mod fast;
 pub mod trajectory;
 mod general;
 pub mod simulator;

@@ -1,0 +1,146 @@
+//! The step loop compiled for several instruction sets, chosen at run time.
+//!
+//! All of them compute the same bits: no operation depends on the width of the registers.
+
+use super::constants::Constants;
+use super::lockstep::{Common, RunResult, simulate};
+use super::step::StepBuffer;
+use crate::trajectory::RunInput;
+
+/// Instruction set of the step loop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InstructionSet {
+    /// What every machine of the architecture has.
+    Portable,
+    /// AVX2: four runs in lock-step.
+    Avx2,
+    /// AVX-512: eight runs in lock-step.
+    Avx512,
+}
+
+impl InstructionSet {
+    /// The widest that this machine has.
+    #[must_use]
+    pub fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512dq")
+            {
+                return Self::Avx512;
+            }
+            if is_x86_feature_detected!("avx2") {
+                return Self::Avx2;
+            }
+        }
+        Self::Portable
+    }
+}
+
+/// One run after the other.
+pub(super) fn one_by_one<const N: usize, const A: usize>(
+    set: InstructionSet,
+    c: &Constants<N, A>,
+    common: &Common,
+    inputs: &[RunInput],
+    jobs: &[usize],
+    results: &mut [Option<RunResult>],
+) {
+    let buffer = &mut StepBuffer::<f64, N>::new();
+    match set {
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: the caller's set comes from `detect` or is checked against it.
+        #[allow(unsafe_code, reason = "calls code for a detected instruction set")]
+        InstructionSet::Avx512 => unsafe {
+            x86::one_by_one_avx512(c, common, inputs, jobs, buffer, results);
+        },
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: as above.
+        #[allow(unsafe_code, reason = "calls code for a detected instruction set")]
+        InstructionSet::Avx2 => unsafe {
+            x86::one_by_one_avx2(c, common, inputs, jobs, buffer, results);
+        },
+        _ => simulate(c, common, inputs, jobs, buffer, results),
+    }
+}
+
+/// As many runs at a time as a register holds.
+pub(super) fn side_by_side<const N: usize, const A: usize>(
+    set: InstructionSet,
+    c: &Constants<N, A>,
+    common: &Common,
+    inputs: &[RunInput],
+    jobs: &[usize],
+    results: &mut [Option<RunResult>],
+) {
+    match set {
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: the caller's set comes from `detect` or is checked against it.
+        #[allow(unsafe_code, reason = "calls code for a detected instruction set")]
+        InstructionSet::Avx512 => unsafe {
+            x86::side_by_side_avx512(c, common, inputs, jobs, results);
+        },
+        #[cfg(target_arch = "x86_64")]
+        // SAFETY: as above.
+        #[allow(unsafe_code, reason = "calls code for a detected instruction set")]
+        InstructionSet::Avx2 => unsafe {
+            x86::side_by_side_avx2(c, common, inputs, jobs, results);
+        },
+        _ => one_by_one(set, c, common, inputs, jobs, results),
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::super::lane_x86::{Pack4, Pack8};
+    use super::{Common, Constants, RunInput, RunResult, StepBuffer, simulate};
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx2")]
+    pub(super) fn one_by_one_avx512<const N: usize, const A: usize>(
+        c: &Constants<N, A>,
+        common: &Common,
+        inputs: &[RunInput],
+        jobs: &[usize],
+        buffer: &mut StepBuffer<f64, N>,
+        results: &mut [Option<RunResult>],
+    ) {
+        simulate(c, common, inputs, jobs, buffer, results);
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn one_by_one_avx2<const N: usize, const A: usize>(
+        c: &Constants<N, A>,
+        common: &Common,
+        inputs: &[RunInput],
+        jobs: &[usize],
+        buffer: &mut StepBuffer<f64, N>,
+        results: &mut [Option<RunResult>],
+    ) {
+        simulate(c, common, inputs, jobs, buffer, results);
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx2")]
+    pub(super) fn side_by_side_avx512<const N: usize, const A: usize>(
+        c: &Constants<N, A>,
+        common: &Common,
+        inputs: &[RunInput],
+        jobs: &[usize],
+        results: &mut [Option<RunResult>],
+    ) {
+        let mut buffer = Box::new(StepBuffer::<Pack8, N>::new());
+        simulate(c, common, inputs, jobs, &mut buffer, results);
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn side_by_side_avx2<const N: usize, const A: usize>(
+        c: &Constants<N, A>,
+        common: &Common,
+        inputs: &[RunInput],
+        jobs: &[usize],
+        results: &mut [Option<RunResult>],
+    ) {
+        let mut buffer = Box::new(StepBuffer::<Pack4, N>::new());
+        simulate(c, common, inputs, jobs, &mut buffer, results);
+    }
+}

@@ -1,0 +1,87 @@
+//! Equilibrium at a given angle with the pressures that hold it (theory note §9).
+
+use super::constants::Constants;
+use super::dynamics::{Point, Rates, Regime, evaluate};
+use super::PlanarFailure as RunFailure;
+
+/// A state at rest.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rest<const N: usize> {
+    /// State, with the pressures that hold it.
+    pub(super) state: Point<f64, N>,
+    /// Eye-to-eye length, m.
+    pub(super) length_m: f64,
+}
+
+/// Iterations of the angle; the correction shrinks by the ratio of body to gravity stiffness, about
+/// 1e-3 for a boom, per iteration.
+const ITERATIONS: u32 = 60;
+
+/// Finds the equilibrium with the cylinder as long as it is at `angle_rad` undeformed.
+pub(super) fn rest<const N: usize, const A: usize>(
+    c: &Constants<N, A>,
+    angle_rad: f64,
+) -> Result<Rest<N>, RunFailure> {
+    let shut = Regime {
+        opening: 0.0,
+        opening_per_s: 0.0,
+        line_pa: [c.cylinder.supply_pa; 2],
+        filled: [1.0; 2],
+    };
+    let mut y = Point::<f64, N>::zero();
+    y.theta = angle_rad;
+    y.p = [c.cylinder.initial_pa; 2];
+    let mut r = Rates::zero();
+    evaluate(c, &y, 0.0, &shut, &mut r);
+    let length_m = r.length;
+    let mut correction = f64::INFINITY;
+    let mut force = 0.0;
+    for _ in 0..ITERATIONS {
+        // Moment balance gives the total force along the cylinder, the modes follow from it.
+        let [gx, gy] = r.gravity;
+        force = (r.moment[0] * gy - r.moment[1] * gx) / r.jt;
+        for i in 0..c.used {
+            let load = gx * c.weight[0][i] + gy * c.weight[1][i] + c.weight_axial[i];
+            y.z[i] = (load - force * r.j[i]) / c.w2[i];
+        }
+        evaluate(c, &y, 0.0, &shut, &mut r);
+        let step = (length_m - r.length) / r.jt;
+        y.theta += step;
+        evaluate(c, &y, 0.0, &shut, &mut r);
+        if !step.is_finite() {
+            return Err(RunFailure::NotFinite {
+                quantity: "equilibrium angle",
+                t_s: 0.0,
+            });
+        }
+        // Two equal corrections in a row are rounding.
+        if step.abs() < 1e-16 || (step.abs() < 1e-12 && step.abs() >= correction) {
+            y.p = holding_pressures(c, force - (r.force - r.cylinder_force));
+            return Ok(Rest { state: y, length_m });
+        }
+        correction = step.abs();
+    }
+    let _ = force;
+    Err(RunFailure::NotConverged {
+        t_s: 0.0,
+        iterations: ITERATIONS,
+        residual: correction,
+        tolerance: 1e-12,
+    })
+}
+
+/// Pressures with A₂ p₂ − A₁ p₁ = `force_n`: the rod side keeps its initial pressure as long as the
+/// piston side stays between tank and supply.
+fn holding_pressures<const N: usize, const A: usize>(c: &Constants<N, A>, force_n: f64) -> [f64; 2] {
+    let cylinder = &c.cylinder;
+    let [a1, a2] = cylinder.area_m2;
+    let rod = cylinder.initial_pa;
+    let piston = (a2 * rod - force_n) / a1;
+    if piston > cylinder.tank_pa && piston < cylinder.supply_pa {
+        return [piston, rod];
+    }
+    // A little distance: at the very end one metering edge has no pressure drop.
+    let margin = 0.02 * (cylinder.supply_pa - cylinder.tank_pa);
+    let piston = piston.clamp(cylinder.tank_pa + margin, cylinder.supply_pa - margin);
+    [piston, (force_n + a1 * piston) / a2]
+}
