@@ -36,6 +36,16 @@ impl InstructionSet {
         }
         Self::Portable
     }
+
+    /// All that this machine has.
+    #[must_use]
+    pub fn available() -> Vec<Self> {
+        match Self::detect() {
+            Self::Portable => vec![Self::Portable],
+            Self::Avx2 => vec![Self::Portable, Self::Avx2],
+            Self::Avx512 => vec![Self::Portable, Self::Avx2, Self::Avx512],
+        }
+    }
 }
 
 /// One run after the other.

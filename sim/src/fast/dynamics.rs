@@ -156,11 +156,7 @@ pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
         ]
     });
     let rod = [shift[0] + k(c.rod_m[0]), shift[1] + k(c.rod_m[1])];
-    let d = [
-        rod[0] - r.base[0],
-        rod[1] - r.base[1],
-        shift[2] + k(c.rod_m[2]),
-    ];
+    let d = [rod[0] - r.base[0], rod[1] - r.base[1], shift[2] + k(c.rod_m[2])];
     r.length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
     let reciprocal = k(1.0) / r.length;
     let n = [d[0] * reciprocal, d[1] * reciprocal, d[2] * reciprocal];
@@ -266,8 +262,7 @@ fn hydraulics<L: Lane, const N: usize>(
     for i in 0..2 {
         // A chamber whose piston has left the barrel keeps a hundredth of the hose.
         let least = k(0.01 * c.compliance_m3_per_pa[i]);
-        let compliance =
-            k(c.compliance_m3_per_pa[i]) + k(c.compliance_slope_m2_per_pa[i]) * chamber[i];
+        let compliance = k(c.compliance_m3_per_pa[i]) + k(c.compliance_slope_m2_per_pa[i]) * chamber[i];
         let compliance = least.where_less(compliance, least, compliance);
         let stiffness = k(1.0) / compliance;
         let drop = regime.line_pa[i] - y.p[i];
@@ -287,13 +282,7 @@ const STOP_DAMPING_DEPTH_M: f64 = 1e-4;
 /// Adds one end stop: `k depth + d min(1, depth/δ) (depth rate)`, never pulling; `sign` −1 at the
 /// inner stop, which pushes the eyes apart.
 #[inline(always)]
-fn end_stop<L: Lane, const N: usize>(
-    stop: &EndStopSpec,
-    depth: L,
-    rate: L,
-    sign: L,
-    r: &mut Rates<L, N>,
-) {
+fn end_stop<L: Lane, const N: usize>(stop: &EndStopSpec, depth: L, rate: L, sign: L, r: &mut Rates<L, N>) {
     let k = |x: f64| L::splat(x);
     let (zero, one) = (k(0.0), k(1.0));
     let share = depth * k(1.0 / STOP_DAMPING_DEPTH_M);
@@ -330,8 +319,7 @@ fn friction<L: Lane>(law: &FrictionSpec, speed: L) -> (L, L) {
             let peak = k(static_n - coulomb_n);
             let force = k(coulomb_n) * t + peak * x * square + k(viscous_n_s_per_m) * speed;
             // d/dx [x / b²] = (b − x b' 2)/b³ with b' = x/2
-            let slope = k(4.0 * coulomb_n) * (k(1.0) - t * t)
-                + peak * (bend - x * x) * square * inverse;
+            let slope = k(4.0 * coulomb_n) * (k(1.0) - t * t) + peak * (bend - x * x) * square * inverse;
             (
                 force,
                 slope * k(1.0 / transition_velocity_m_per_s) + k(viscous_n_s_per_m),

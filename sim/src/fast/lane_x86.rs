@@ -9,14 +9,13 @@
 
 use super::lane::Lane;
 use core::arch::x86_64::{
-    __m256d, __m512d, _mm256_add_epi64, _mm256_add_pd, _mm256_and_pd, _mm256_andnot_pd,
-    _mm256_blendv_pd, _mm256_castpd_si256, _mm256_castsi256_pd, _mm256_cmp_pd, _mm256_div_pd,
-    _mm256_max_pd, _mm256_mul_pd, _mm256_or_pd, _mm256_set1_epi64x, _mm256_set1_pd,
-    _mm256_slli_epi64, _mm256_sqrt_pd, _mm256_sub_pd, _mm256_xor_pd, _mm512_abs_pd,
-    _mm512_add_epi64, _mm512_add_pd, _mm512_castpd_si512, _mm512_castsi512_pd,
-    _mm512_cmp_pd_mask, _mm512_div_pd, _mm512_mask_blend_pd, _mm512_max_pd, _mm512_mul_pd,
-    _mm512_set1_epi64, _mm512_set1_pd, _mm512_slli_epi64, _mm512_sqrt_pd, _mm512_sub_pd,
-    _mm512_ternarylogic_epi64, _mm512_xor_epi64, _CMP_LT_OQ,
+    __m256d, __m512d, _CMP_LT_OQ, _mm256_add_epi64, _mm256_add_pd, _mm256_and_pd, _mm256_andnot_pd,
+    _mm256_blendv_pd, _mm256_castpd_si256, _mm256_castsi256_pd, _mm256_cmp_pd, _mm256_div_pd, _mm256_max_pd,
+    _mm256_mul_pd, _mm256_or_pd, _mm256_set1_epi64x, _mm256_set1_pd, _mm256_slli_epi64, _mm256_sqrt_pd,
+    _mm256_sub_pd, _mm256_xor_pd, _mm512_abs_pd, _mm512_add_epi64, _mm512_add_pd, _mm512_castpd_si512,
+    _mm512_castsi512_pd, _mm512_cmp_pd_mask, _mm512_div_pd, _mm512_mask_blend_pd, _mm512_max_pd,
+    _mm512_mul_pd, _mm512_set1_epi64, _mm512_set1_pd, _mm512_slli_epi64, _mm512_sqrt_pd, _mm512_sub_pd,
+    _mm512_ternarylogic_epi64, _mm512_xor_epi64,
 };
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
@@ -166,7 +165,10 @@ impl Neg for Pack8 {
     fn neg(self) -> Self {
         unsafe {
             let bits = _mm512_castpd_si512(self.0);
-            Self(_mm512_castsi512_pd(_mm512_xor_epi64(bits, _mm512_set1_epi64(i64::MIN))))
+            Self(_mm512_castsi512_pd(_mm512_xor_epi64(
+                bits,
+                _mm512_set1_epi64(i64::MIN),
+            )))
         }
     }
 }

@@ -2,7 +2,6 @@
 //!
 //! Lanes share the instructions and nothing else: a run's numbers do not depend on its neighbours.
 
-use super::PlanarFailure;
 use super::constants::Constants;
 use super::dynamics::{Point, Regime};
 use super::lane::Lane;
@@ -12,10 +11,10 @@ use super::step::{StepBuffer, step};
 use super::sums::sums;
 use super::tableau::{RODAS5P, Tableau};
 use super::track::{Outcome, Track, Verdict};
-use crate::trajectory::{RunInput, Trajectory};
+use crate::trajectory::{RunFailure, RunInput, Trajectory};
 
 /// Result of one run of a batch.
-pub(super) type RunResult = Result<Trajectory, PlanarFailure>;
+pub(super) type RunResult = Result<Trajectory, RunFailure>;
 
 /// What all runs of a batch have in common.
 #[derive(Debug, Clone, Copy)]
@@ -154,7 +153,7 @@ fn advance<L: Lane, const N: usize, const A: usize>(
     error2: f64,
     lane: usize,
     c: &Constants<N, A>,
-) -> Result<Option<Verdict>, PlanarFailure> {
+) -> Result<Option<Verdict>, RunFailure> {
     if track.record_due {
         let machine = machine_channels(track.valve_at_sample(), track.alpha, state, &buffer.start, lane);
         track.record(&machine, |k| c.readouts[k].value(readings, lane))?;
@@ -181,12 +180,7 @@ fn advance<L: Lane, const N: usize, const A: usize>(
     track.judge(&outcome, &c.cylinder).map(Some)
 }
 
-fn load<L: Lane, const N: usize>(
-    state: &mut Point<L, N>,
-    lane: usize,
-    from: &Point<f64, N>,
-    used: usize,
-) {
+fn load<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Point<f64, N>, used: usize) {
     state.theta.set(lane, from.theta);
     state.omega.set(lane, from.omega);
     for i in 0..used {
@@ -200,12 +194,7 @@ fn load<L: Lane, const N: usize>(
 
 /// Copies one lane.
 #[inline(always)]
-fn take<L: Lane, const N: usize>(
-    state: &mut Point<L, N>,
-    lane: usize,
-    from: &Point<L, N>,
-    used: usize,
-) {
+fn take<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Point<L, N>, used: usize) {
     if L::WIDTH == 1 {
         *state = *from;
         return;

@@ -24,54 +24,11 @@ mod track;
 pub use dispatch::InstructionSet;
 pub use model::{MOST_MODES, NotPlanar, PlanarModel};
 
-use crate::trajectory::{RunInput, Trajectory};
+use crate::equilibrium::EquilibriumError;
+use crate::simulator::SimulatorError;
+use crate::trajectory::{InputError, RunFailure, RunInput, Trajectory};
 use lockstep::{Common, RunResult};
 use model::Modes;
-
-/// Why a run ended early.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum PlanarFailure {
-    /// The step or the equilibrium did not converge.
-    #[error("no convergence at {t_s} s after {iterations} attempts: residual {residual:e}, tolerance {tolerance:e}")]
-    NotConverged {
-        /// Time of the run, s.
-        t_s: f64,
-        /// Attempts.
-        iterations: u32,
-        /// What is left.
-        residual: f64,
-        /// What is allowed.
-        tolerance: f64,
-    },
-    /// A number is not finite.
-    #[error("{quantity} is not finite at {t_s} s")]
-    NotFinite {
-        /// Which.
-        quantity: &'static str,
-        /// Time of the run, s.
-        t_s: f64,
-    },
-    /// The modes with this payload cannot be found.
-    #[error(transparent)]
-    Modes(#[from] NotPlanar),
-    /// The run does not fit the model.
-    #[error("{0}")]
-    Input(BadInput),
-}
-
-/// What is wrong with a run's input.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum BadInput {
-    /// Not one angle.
-    #[error("the run must give one angle")]
-    Angles,
-    /// Not one valve signal.
-    #[error("the run must give one valve signal")]
-    Valves,
-    /// A payload on a body without payload interface.
-    #[error("the run has a payload, and the body no interface for it")]
-    Payload,
-}
 
 /// Default accuracy: every channel but accelerations within 1e-3 of its range.
 pub const TOLERANCE: f64 = 1e-3;
@@ -87,20 +44,28 @@ impl PlanarModel {
     /// its usual range; [`TOLERANCE`] is the default, 1e-4 the other proven value.
     ///
     /// # Errors
-    /// [`PlanarFailure`] if the run cannot be finished.
+    /// [`RunFailure`] if the run cannot be finished.
     pub fn run(
         &self,
         input: &RunInput,
         sample_time_s: f64,
         tolerance: f64,
         ws: &mut Workspace,
-    ) -> Result<Trajectory, PlanarFailure> {
+    ) -> Result<Trajectory, RunFailure> {
         let inputs = std::slice::from_ref(input);
         let common = Common::new(sample_time_s, tolerance);
         let mut results = [None];
-        self.group(inputs, &[0], &common, Layout::OneByOne, InstructionSet::detect(), ws, &mut results);
+        self.group(
+            inputs,
+            &[0],
+            &common,
+            Layout::OneByOne,
+            InstructionSet::detect(),
+            ws,
+            &mut results,
+        );
         let [result] = results;
-        result.unwrap_or(Err(PlanarFailure::Input(BadInput::Angles)))
+        result.unwrap_or(Err(UNFINISHED))
     }
 
     /// Simulates many runs, as many at a time as a vector register holds; results in the order of
@@ -111,7 +76,7 @@ impl PlanarModel {
         sample_time_s: f64,
         tolerance: f64,
         ws: &mut Workspace,
-    ) -> Vec<Result<Trajectory, PlanarFailure>> {
+    ) -> Vec<Result<Trajectory, RunFailure>> {
         self.run_batch_on(InstructionSet::detect(), inputs, sample_time_s, tolerance, ws)
     }
 
@@ -124,24 +89,37 @@ impl PlanarModel {
         sample_time_s: f64,
         tolerance: f64,
         ws: &mut Workspace,
-    ) -> Vec<Result<Trajectory, PlanarFailure>> {
+    ) -> Vec<Result<Trajectory, RunFailure>> {
         let common = Common::new(sample_time_s, tolerance);
         let mut results: Vec<_> = inputs.iter().map(|_| None).collect();
         // Lanes share the modes, so a group has one payload.
         let mut order: Vec<usize> = (0..inputs.len()).collect();
-        order.sort_by(|&i, &j| inputs[i].payload_kg.total_cmp(&inputs[j].payload_kg).then(i.cmp(&j)));
-        for jobs in order.chunk_by(|&i, &j| inputs[i].payload_kg.to_bits() == inputs[j].payload_kg.to_bits()) {
-            let layout = if jobs.len() > 1 { Layout::SideBySide } else { Layout::OneByOne };
+        order.sort_by(|&i, &j| {
+            inputs[i]
+                .payload_kg
+                .total_cmp(&inputs[j].payload_kg)
+                .then(i.cmp(&j))
+        });
+        for jobs in order.chunk_by(|&i, &j| inputs[i].payload_kg.to_bits() == inputs[j].payload_kg.to_bits())
+        {
+            let layout = if jobs.len() > 1 {
+                Layout::SideBySide
+            } else {
+                Layout::OneByOne
+            };
             self.group(inputs, jobs, &common, layout, set, ws, &mut results);
         }
         results
             .into_iter()
-            .map(|r| r.unwrap_or(Err(PlanarFailure::Input(BadInput::Angles))))
+            .map(|r| r.unwrap_or(Err(UNFINISHED)))
             .collect()
     }
 
     /// Simulates runs of one payload.
-    #[allow(clippy::too_many_arguments, reason = "the one place where batch and single run meet")]
+    #[allow(
+        clippy::too_many_arguments,
+        reason = "the one place where batch and single run meet"
+    )]
     fn group(
         &self,
         inputs: &[RunInput],
@@ -156,7 +134,7 @@ impl PlanarModel {
         for &job in jobs {
             match self.check(&inputs[job]) {
                 Ok(()) => fit.push(job),
-                Err(bad) => results[job] = Some(Err(PlanarFailure::Input(bad))),
+                Err(bad) => results[job] = Some(Err(bad)),
             }
         }
         let Some(&first) = fit.first() else { return };
@@ -168,8 +146,9 @@ impl PlanarModel {
         let modes = match modes {
             Ok(modes) => ws.modes.insert(modes),
             Err(reason) => {
+                let reason = RunFailure::Machine(SimulatorError::Planar(reason));
                 for job in fit {
-                    results[job] = Some(Err(PlanarFailure::Modes(reason.clone())));
+                    results[job] = Some(Err(reason.clone()));
                 }
                 return;
             }
@@ -189,19 +168,42 @@ impl PlanarModel {
         sizes!((8, 4), (16, 8), (32, 32));
     }
 
-    fn check(&self, input: &RunInput) -> Result<(), BadInput> {
-        if input.angles_rad.len() != 1 {
-            return Err(BadInput::Angles);
+    fn check(&self, input: &RunInput) -> Result<(), RunFailure> {
+        let number = |name, value, allowed| RunFailure::Input(InputError::Number { name, value, allowed });
+        let &[angle_rad] = input.angles_rad.as_slice() else {
+            return Err(RunFailure::NoEquilibrium(EquilibriumError::AngleCount {
+                given: input.angles_rad.len(),
+                expected: 1,
+            }));
+        };
+        if !angle_rad.is_finite() {
+            return Err(number("angle", angle_rad, "a number of radians"));
         }
-        if input.valves_ratio.len() != 1 {
-            return Err(BadInput::Valves);
+        let [valve] = input.valves_ratio.as_slice() else {
+            return Err(RunFailure::Input(InputError::ValveCount {
+                given: input.valves_ratio.len(),
+                expected: 1,
+            }));
+        };
+        if let Some(k) = valve.iter().position(|u| !(-1.0..=1.0).contains(u)) {
+            return Err(RunFailure::Input(InputError::ValveRange {
+                value: valve[k],
+                sample: k + 1,
+            }));
         }
-        if input.payload_kg != 0.0 && !self.carries_payload() {
-            return Err(BadInput::Payload);
+        let fits = input.payload_kg == 0.0 || self.carries_payload();
+        if !(fits && input.payload_kg.is_finite() && input.payload_kg >= 0.0) {
+            return Err(number("payload", input.payload_kg, "carried by the machine"));
         }
         Ok(())
     }
 }
+
+/// Every run of a group leaves a result; this one would say that it did not.
+const UNFINISHED: RunFailure = RunFailure::NotFinite {
+    quantity: "result",
+    t_s: 0.0,
+};
 
 /// How the runs of a group share the registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -111,8 +111,8 @@ impl PlanarModel {
         }
         let (pivot_m, pivot) =
             ground_and_body(&joint.from, &joint.to, &flexible.name).ok_or(NotPlanar::Joints)?;
-        let (base_m, rod) = ground_and_body(&cylinder.base, &cylinder.rod, &flexible.name)
-            .ok_or(NotPlanar::Cylinders)?;
+        let (base_m, rod) =
+            ground_and_body(&cylinder.base, &cylinder.rod, &flexible.name).ok_or(NotPlanar::Cylinders)?;
         let pivot = interface(body, pivot)?;
         let rod = interface(body, rod)?;
         // The static modes are unit motions of an interface: 1e-9 of that is rounding.
@@ -156,8 +156,7 @@ impl PlanarModel {
         let o = pivot.position_m;
         let centre = body.centre_of_mass_m * body.mass_kg;
         // About the pivot instead of the frame's origin (both in the plane of rotation).
-        let inertia_kg_m2 = body.inertia_origin_kg_m2[(2, 2)]
-            - 2.0 * (centre.x * o.x + centre.y * o.y)
+        let inertia_kg_m2 = body.inertia_origin_kg_m2[(2, 2)] - 2.0 * (centre.x * o.x + centre.y * o.y)
             + body.mass_kg * (o.x * o.x + o.y * o.y);
         let h0 = RowDVector::from_fn(n, |_, k| {
             -body.c_xp[(2, k)] - (o.x * body.c_pt[(1, k)] - o.y * body.c_pt[(0, k)])
@@ -215,8 +214,7 @@ impl PlanarModel {
         if let Some((_, rows)) = &self.payload {
             mass += rows.transpose() * rows * payload_kg;
         }
-        let (values, phi) =
-            eigen::generalised(&self.stiffness_modal, &mass).ok_or(NotPlanar::Mass)?;
+        let (values, phi) = eigen::generalised(&self.stiffness_modal, &mass).ok_or(NotPlanar::Mass)?;
         let damping = phi.transpose() * &self.damping_modal * &phi;
         for i in 0..values.len() {
             for j in 0..i {
@@ -238,17 +236,18 @@ impl PlanarModel {
 
     /// Constants of the step loop for a payload, padded to `N` modes of which `A` are coupled.
     /// `None` if the modes do not fit.
-    pub(super) fn constants<const N: usize, const A: usize>(
-        &self,
-        modes: &Modes,
-    ) -> Option<Constants<N, A>> {
+    pub(super) fn constants<const N: usize, const A: usize>(&self, modes: &Modes) -> Option<Constants<N, A>> {
         let n = modes.w2.len();
         let order = self.order(modes);
         if n > N || order.coupled > A {
             return None;
         }
         let phi = DMatrix::from_fn(n, n, |i, j| modes.phi[(i, order.columns[j])]);
-        let m = if self.payload.is_some() { modes.payload_kg } else { 0.0 };
+        let m = if self.payload.is_some() {
+            modes.payload_kg
+        } else {
+            0.0
+        };
         let (at, rows) = self
             .payload
             .clone()
@@ -273,10 +272,8 @@ impl PlanarModel {
             }
         });
         let rod = [0, 1, 2].map(|i| plane(&self.rod, i));
-        let b = phi.transpose() * &self.b * &phi
-            + (px.transpose() * &px + py.transpose() * &py) * m;
-        let cc = phi.transpose() * &self.cc * &phi
-            + (py.transpose() * &px - px.transpose() * &py) * (-m);
+        let b = phi.transpose() * &self.b * &phi + (px.transpose() * &px + py.transpose() * &py) * m;
+        let cc = phi.transpose() * &self.cc * &phi + (py.transpose() * &px - px.transpose() * &py) * (-m);
         let square = |m: &DMatrix<f64>| {
             let mut out = [[0.0; A]; A];
             for (j, column) in out.iter_mut().enumerate().take(order.coupled) {
@@ -386,11 +383,7 @@ pub(super) struct Modes {
 }
 
 /// The ground's point and the body's interface of two attachments, whichever comes first.
-fn ground_and_body<'a>(
-    a: &'a Attachment,
-    b: &'a Attachment,
-    body: &str,
-) -> Option<([f64; 3], &'a str)> {
+fn ground_and_body<'a>(a: &'a Attachment, b: &'a Attachment, body: &str) -> Option<([f64; 3], &'a str)> {
     let (ground, other) = if a.body == "ground" { (a, b) } else { (b, a) };
     if ground.body != "ground" || other.body != body {
         return None;

@@ -165,15 +165,10 @@ pub(super) fn solve<L: Lane, const N: usize, const A: usize>(
     let s = f.s;
     let s2 = s * s;
     let [rho, hv, kz] = sums(count, |i| {
-        [
-            r0.j[i] * rhs.z[i],
-            r0.h[i] * rhs.v[i],
-            f.k_tz[i] * rhs.z[i],
-        ]
+        [r0.j[i] * rhs.z[i], r0.h[i] * rhs.v[i], f.k_tz[i] * rhs.z[i]]
     });
     let rho = r0.jt * rhs.theta + rho;
-    let from_pressure =
-        f.area[1] * f.kappa[1] * rhs.p[1] - f.area[0] * f.kappa[0] * rhs.p[0];
+    let from_pressure = f.area[1] * f.kappa[1] * rhs.p[1] - f.area[0] * f.kappa[0] * rhs.p[0];
     let known = from_pressure + s * (f.d_star_jd * rhs.theta + f.k_star * rho);
     let push = s * known;
     let bt = s * (r0.inertia * rhs.omega + hv) - s2 * (f.k_tt * rhs.theta + kz) - push * r0.jt;

@@ -2,7 +2,8 @@
 
 use super::constants::Constants;
 use super::dynamics::{Point, Rates, Regime, evaluate};
-use super::PlanarFailure as RunFailure;
+use crate::equilibrium::EquilibriumError;
+use crate::trajectory::RunFailure;
 
 /// A state at rest.
 #[derive(Debug, Clone, Copy)]
@@ -15,7 +16,7 @@ pub(super) struct Rest<const N: usize> {
 
 /// Iterations of the angle; the correction shrinks by the ratio of body to gravity stiffness, about
 /// 1e-3 for a boom, per iteration.
-const ITERATIONS: u32 = 60;
+const ITERATIONS: usize = 60;
 
 /// Finds the equilibrium with the cylinder as long as it is at `angle_rad` undeformed.
 pub(super) fn rest<const N: usize, const A: usize>(
@@ -35,11 +36,10 @@ pub(super) fn rest<const N: usize, const A: usize>(
     evaluate(c, &y, 0.0, &shut, &mut r);
     let length_m = r.length;
     let mut correction = f64::INFINITY;
-    let mut force = 0.0;
     for _ in 0..ITERATIONS {
         // Moment balance gives the total force along the cylinder, the modes follow from it.
         let [gx, gy] = r.gravity;
-        force = (r.moment[0] * gy - r.moment[1] * gx) / r.jt;
+        let force = (r.moment[0] * gy - r.moment[1] * gx) / r.jt;
         for i in 0..c.used {
             let load = gx * c.weight[0][i] + gy * c.weight[1][i] + c.weight_axial[i];
             y.z[i] = (load - force * r.j[i]) / c.w2[i];
@@ -61,13 +61,10 @@ pub(super) fn rest<const N: usize, const A: usize>(
         }
         correction = step.abs();
     }
-    let _ = force;
-    Err(RunFailure::NotConverged {
-        t_s: 0.0,
+    Err(RunFailure::NoEquilibrium(EquilibriumError::NotConverged {
         iterations: ITERATIONS,
-        residual: correction,
-        tolerance: 1e-12,
-    })
+        increment: correction,
+    }))
 }
 
 /// Pressures with A₂ p₂ − A₁ p₁ = `force_n`: the rod side keeps its initial pressure as long as the

@@ -66,8 +66,7 @@ pub(super) fn step<L: Lane, const N: usize, const A: usize>(
         let at = if stage == 0 {
             &w.start
         } else {
-            let opening =
-                regime.opening + L::splat(method.time[stage]) * h * regime.opening_per_s;
+            let opening = regime.opening + L::splat(method.time[stage]) * h * regime.opening_per_s;
             evaluate(c, &w.next, opening, regime, &mut w.end);
             &w.end
         };
@@ -130,8 +129,30 @@ fn gather<L: Lane, const N: usize>(
         w.rhs.p[i] = rhs;
         w.next.p[i] = previous.map_or(p, |u| w.next.p[i] + u.p[i]);
     }
-    blocks(a, c, u, count, inverse_h, |u| &u.z, &y.z, chained, &mut w.next.z, &mut w.rhs.z);
-    blocks(a, c, u, count, inverse_h, |u| &u.v, &y.v, chained, &mut w.next.v, &mut w.rhs.v);
+    blocks(
+        a,
+        c,
+        u,
+        count,
+        inverse_h,
+        |u| &u.z,
+        &y.z,
+        chained,
+        &mut w.next.z,
+        &mut w.rhs.z,
+    );
+    blocks(
+        a,
+        c,
+        u,
+        count,
+        inverse_h,
+        |u| &u.v,
+        &y.v,
+        chained,
+        &mut w.next.v,
+        &mut w.rhs.v,
+    );
 }
 
 /// The same for an array of modes, four at a time.
@@ -215,11 +236,7 @@ fn error2<L: Lane, const N: usize, const A: usize>(
     let count = L::trip(N, c.used);
     let k = |x: f64| L::splat(x);
     let [jz, jv, energy] = sums(count, |i| {
-        [
-            r.j[i] * u.z[i],
-            r.j[i] * u.v[i],
-            u.z[i] * u.z[i] * k(c.w2[i]),
-        ]
+        [r.j[i] * u.z[i], r.j[i] * u.v[i], u.z[i] * u.z[i] * k(c.w2[i])]
     });
     let travel = (jz + r.jt * u.theta) * k(c.scale.per_m);
     let speed = (jv + r.jt * u.omega) * k(c.scale.per_m_per_s);

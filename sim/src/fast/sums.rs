@@ -5,10 +5,7 @@ use super::lane::Lane;
 /// `M` sums of `term` over `0..count`: four partial sums by index modulo 4, then
 /// `(s₀ + s₁) + (s₂ + s₃)`. Zero terms at the end do not change the result.
 #[inline(always)]
-pub(super) fn sums<L: Lane, const M: usize>(
-    count: usize,
-    term: impl Fn(usize) -> [L; M],
-) -> [L; M] {
+pub(super) fn sums<L: Lane, const M: usize>(count: usize, term: impl Fn(usize) -> [L; M]) -> [L; M] {
     let zero = L::splat(0.0);
     let mut part = [[zero; M]; 4];
     let whole = count - count % 4;

@@ -1,4 +1,4 @@
-//! Coefficients of the Rosenbrock methods, in the transformed form that needs no product with the
+//! Coefficients of the Rosenbrock method, in the transformed form that needs no product with the
 //! Jacobian: (1/(γ h) − J) uᵢ = f(y + Σ aᵢⱼ uⱼ) + Σ cᵢⱼ/h uⱼ + γᵢ h ∂f/∂t.
 
 /// Most stages of a method.
@@ -26,38 +26,6 @@ pub(super) struct Tableau {
     /// (y₁ − y₀ − Σ slopeⱼ uⱼ)/h.
     pub(super) slope: [f64; STAGES],
 }
-
-/// RODAS: order 4 with an estimate of order 3, 6 stages. Hairer and Wanner, *Solving Ordinary
-/// Differential Equations II* (1996), section VI.4.
-#[rustfmt::skip]
-pub(super) static RODAS4: Tableau = Tableau {
-    stages: 6,
-    chain: 5,
-    gamma: 0.25,
-    a: [
-        [0.0; STAGES],
-        [1.544, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [0.946_678_528_081_582_6, 0.255_701_169_898_328_4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3.314_825_187_068_521, 2.896_124_015_972_201, 0.998_641_913_997_781_7, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1.221_224_509_226_641, 6.019_134_481_288_629, 12.537_083_329_320_87, -0.687_886_036_105_895, 0.0, 0.0, 0.0, 0.0],
-        [0.0; STAGES],
-        [0.0; STAGES],
-        [0.0; STAGES],
-    ],
-    c: [
-        [0.0; STAGES],
-        [-5.6688, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [-2.430_093_356_833_875, -0.206_359_915_709_191_5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [-0.107_352_905_815_137_5, -9.594_562_251_023_355, -20.470_286_148_096_16, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [7.496_443_313_967_647, -10.246_804_314_643_52, -33.999_903_528_199_05, 11.708_908_932_061_6, 0.0, 0.0, 0.0, 0.0],
-        [8.083_246_795_921_522, -7.981_132_988_064_893, -31.521_594_328_743_71, 16.319_305_431_231_36, -6.058_818_238_834_054, 0.0, 0.0, 0.0],
-        [0.0; STAGES],
-        [0.0; STAGES],
-    ],
-    time: [0.0, 0.386, 0.21, 0.63, 1.0, 1.0, 0.0, 0.0],
-    d: [0.25, -0.1043, 0.1035, -0.0362, 0.0, 0.0, 0.0, 0.0],
-    slope: [9.449_954_744_165_733, -1.400_281_225_930_152_5, -18.370_075_406_632_69, 16.774_453_406_615_034, -5.569_251_402_421_210_5, 0.0, 0.0, 0.0],
-};
 
 /// Rodas5P: order 5 with an estimate of order 4, 8 stages. Steinebach, *Construction of
 /// Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia differential equations
@@ -96,8 +64,6 @@ pub(super) static RODAS5P: Tableau = Tableau {
 mod tests {
     use super::*;
 
-    /// y' = λ y + t³ λ-free forcing, one step: u satisfies the scheme for a scalar, so the error of
-    /// halved steps shows the order.
     fn integrate(method: &Tableau, steps: u32) -> f64 {
         // y' = −y² + t, y(0) = 1: nonlinear and non-autonomous.
         let h = 1.0 / f64::from(steps);
@@ -123,14 +89,12 @@ mod tests {
     }
 
     #[test]
-    fn show_their_order() {
-        for (method, order) in [(&RODAS4, 4.0), (&RODAS5P, 5.0)] {
-            let fine = integrate(&RODAS5P, 400);
-            let coarse = (integrate(method, 8) - fine).abs();
-            let halved = (integrate(method, 16) - fine).abs();
-            let seen = (coarse / halved).log2();
-            // Half an order of slack: higher terms still show at these steps.
-            assert!((seen - order).abs() < 0.6, "order {seen}, expected {order}");
-        }
+    fn shows_its_order() {
+        let fine = integrate(&RODAS5P, 400);
+        let coarse = (integrate(&RODAS5P, 8) - fine).abs();
+        let halved = (integrate(&RODAS5P, 16) - fine).abs();
+        let seen = (coarse / halved).log2();
+        // Half an order of slack: higher terms still show at these steps.
+        assert!((seen - 5.0).abs() < 0.6, "order {seen}");
     }
 }

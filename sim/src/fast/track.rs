@@ -1,11 +1,10 @@
 //! Bookkeeping of one run in one lane: where it is in its signal, how long the next step is, what
 //! happened so far.
 
-use super::PlanarFailure;
 use super::constants::Cylinder;
 use super::record::MACHINE_CHANNELS;
 use super::schedule::{Piece, pieces};
-use crate::trajectory::{RunInput, SolverStatistics, Trajectory};
+use crate::trajectory::{RunFailure, RunInput, SolverStatistics, Trajectory};
 use hydroflex_openapi::job::RunFlag;
 
 /// Attempts within one piece of signal before a run is given up: two thousand times the usual one.
@@ -176,11 +175,7 @@ impl<'a> Track<'a> {
     }
 
     /// Judges a step and plans the next attempt.
-    pub(super) fn judge(
-        &mut self,
-        outcome: &Outcome,
-        cylinder: &Cylinder,
-    ) -> Result<Verdict, PlanarFailure> {
+    pub(super) fn judge(&mut self, outcome: &Outcome, cylinder: &Cylinder) -> Result<Verdict, RunFailure> {
         self.attempts += 1;
         self.statistics.factorisations += 1;
         // Written so that a NaN is a rejection.
@@ -225,17 +220,17 @@ impl<'a> Track<'a> {
         Ok(Verdict::Accept)
     }
 
-    fn retry(&mut self, step_s: f64, outcome: &Outcome) -> Result<Verdict, PlanarFailure> {
+    fn retry(&mut self, step_s: f64, outcome: &Outcome) -> Result<Verdict, RunFailure> {
         if step_s < SHORTEST_S || self.attempts >= ATTEMPTS {
             return Err(if outcome.finite {
-                PlanarFailure::NotConverged {
+                RunFailure::NotConverged {
                     t_s: self.time_s(),
                     iterations: self.attempts,
-                    residual: outcome.error2.sqrt(),
+                    increment: outcome.error2.sqrt(),
                     tolerance: 1.0,
                 }
             } else {
-                PlanarFailure::NotFinite {
+                RunFailure::NotFinite {
                     quantity: "state",
                     t_s: self.time_s(),
                 }
@@ -316,11 +311,11 @@ impl<'a> Track<'a> {
         &mut self,
         machine: &[f64; MACHINE_CHANNELS],
         sensor: impl Fn(usize) -> f64,
-    ) -> Result<(), PlanarFailure> {
+    ) -> Result<(), RunFailure> {
         self.record_due = false;
         // One sum finds any NaN or infinity among accelerations, forces, pressures and motion.
         if !machine.iter().sum::<f64>().is_finite() {
-            return Err(PlanarFailure::NotFinite {
+            return Err(RunFailure::NotFinite {
                 quantity: "sample",
                 t_s: self.time_s(),
             });
