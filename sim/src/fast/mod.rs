@@ -21,6 +21,9 @@ mod sums;
 mod tableau;
 mod track;
 
+#[cfg(test)]
+mod tests;
+
 pub use dispatch::InstructionSet;
 pub use model::{MOST_MODES, NotPlanar, PlanarModel};
 

@@ -234,11 +234,19 @@ impl PlanarModel {
         })
     }
 
-    /// Constants of the step loop for a payload, padded to `N` modes of which `A` are coupled.
-    /// `None` if the modes do not fit.
+    /// Constants of the step loop for a payload, padded to `N` modes of which `A` have inertia
+    /// products. `None` if the modes do not fit.
     pub(super) fn constants<const N: usize, const A: usize>(&self, modes: &Modes) -> Option<Constants<N, A>> {
+        self.ordered_constants(modes, &self.order(modes))
+    }
+
+    /// The same for a given order of the modes.
+    pub(super) fn ordered_constants<const N: usize, const A: usize>(
+        &self,
+        modes: &Modes,
+        order: &Order,
+    ) -> Option<Constants<N, A>> {
         let n = modes.w2.len();
-        let order = self.order(modes);
         if n > N || order.coupled > A {
             return None;
         }
@@ -341,7 +349,7 @@ impl PlanarModel {
     /// Modes by how far the machine's forces deflect them. Those of at least a five-hundredth of
     /// the largest have inertia products; the others change Θ and h by less than the products of
     /// their tiny amplitude (§3 of the theory page has the estimate, a test the proof).
-    fn order(&self, modes: &Modes) -> Order {
+    pub(super) fn order(&self, modes: &Modes) -> Order {
         let c = &self.cylinder;
         let force_n = (c.supply_pa - c.tank_pa).max(1.0) * c.area_m2[0];
         let g = Vector3::from(self.gravity_m_per_s2).norm();
@@ -368,9 +376,13 @@ impl PlanarModel {
 /// Smallest amplitude, over the largest, of a mode with inertia products.
 const COUPLED: f64 = 2e-3;
 
-struct Order {
-    columns: Vec<usize>,
-    coupled: usize,
+/// Order of the modes in the step loop.
+#[derive(Debug, Clone)]
+pub(super) struct Order {
+    /// Columns of the mode matrix.
+    pub(super) columns: Vec<usize>,
+    /// How many of the first have inertia products.
+    pub(super) coupled: usize,
 }
 
 /// Modes of the body with one payload.
@@ -379,7 +391,8 @@ pub(super) struct Modes {
     pub(super) payload_kg: f64,
     w2: Vec<f64>,
     damping: Vec<f64>,
-    phi: DMatrix<f64>,
+    /// Modal coordinates of the body per mode, ascending frequency.
+    pub(super) phi: DMatrix<f64>,
 }
 
 /// The ground's point and the body's interface of two attachments, whichever comes first.
