@@ -26,4 +26,4 @@ pub mod train;
 pub mod model;
 pub mod predict;
 pub mod evaluate;
-//pub mod plot;
+pub mod plot;
