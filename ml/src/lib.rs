@@ -16,6 +16,7 @@
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
 
 pub mod runs;
+pub mod dataset;
 pub mod recording;
 pub mod window;
 pub mod scaling;

@@ -3,6 +3,7 @@
 //! A recording is a table with `run_id`, `step` and one column per signal, sorted by run and step
 //! within each run; other columns are left alone.
 
+use crate::model::Model;
 use crate::runs::{RunSamples, Runs, RunsError};
 use arrow::array::{
     Array, ArrayRef, AsArray, BooleanArray, Float64Array, RecordBatch, UInt32Array, UInt64Array,
@@ -258,6 +259,58 @@ pub struct PredictionTable {
     pub targets: Vec<PredictedColumn>,
     /// Whether the window is inside the envelope, where the model has one.
     pub inside_envelope: Option<Vec<Option<bool>>>,
+}
+
+/// Estimates for every sample of `runs`, whose channels are the model's inputs in their order.
+///
+/// # Panics
+/// When the channels are not the model's inputs.
+#[must_use]
+pub fn predict_runs(model: &Model, runs: &Runs) -> PredictionTable {
+    let predictor = model.predictor();
+    let mut workspace = predictor.workspace();
+    let mut table = PredictionTable {
+        targets: model
+            .config()
+            .targets
+            .iter()
+            .map(|channel| PredictedColumn {
+                name: channel.name.clone(),
+                values: Vec::new(),
+                bounds: predictor.has_intervals().then(|| (Vec::new(), Vec::new())),
+            })
+            .collect(),
+        inside_envelope: predictor.has_envelope().then(Vec::new),
+        ..PredictionTable::default()
+    };
+    for run in &runs.runs {
+        let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
+        let series = predictor.predict_series_with(&columns, &mut workspace);
+        let blind = series.first_row.min(run.len());
+        table.run_id.extend(std::iter::repeat_n(run.run_id, run.len()));
+        table
+            .step
+            .extend((0..run.len()).map(|step| u32::try_from(step).unwrap_or(u32::MAX)));
+        for (t, (target, column)) in table.targets.iter_mut().zip(&series.columns).enumerate() {
+            target.values.extend(std::iter::repeat_n(None, blind));
+            target.values.extend(column.iter().copied().map(Some));
+            if let Some((lower, upper)) = &mut target.bounds {
+                for (bound, sign) in [(lower, -1.0), (upper, 1.0)] {
+                    bound.extend(std::iter::repeat_n(None, blind));
+                    bound.extend(
+                        column
+                            .iter()
+                            .map(|&y| predictor.half_width(t, y).map(|half| y + sign * half)),
+                    );
+                }
+            }
+        }
+        if let Some(inside) = &mut table.inside_envelope {
+            inside.extend(std::iter::repeat_n(None, blind));
+            inside.extend(series.inside.iter().copied().map(Some));
+        }
+    }
+    table
 }
 
 /// Writes `run_id`, `step`, then per target `X`, `X_lower`, `X_upper`, and `inside_envelope`.

@@ -118,17 +118,16 @@ pub fn significant(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return format!("{value}");
     }
-    let magnitude = value.abs().log10().floor();
-    if (-6.0..6.0).contains(&magnitude) {
-        #[allow(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "between 0 and 8"
-        )]
-        let decimals = (2.0 - magnitude).max(0.0) as usize;
+    let rounded = format!("{value:.2e}");
+    let magnitude: i32 = rounded
+        .split_once('e')
+        .and_then(|(_, power)| power.parse().ok())
+        .unwrap_or(0);
+    if (-6..6).contains(&magnitude) {
+        let decimals = usize::try_from(2 - magnitude).unwrap_or(0);
         format!("{value:.decimals$}")
     } else {
-        format!("{value:.2e}")
+        rounded
     }
 }
 
@@ -141,6 +140,7 @@ mod tests {
         assert_eq!(significant(0.000_612_3), "0.000612");
         assert_eq!(significant(12.345), "12.3");
         assert_eq!(significant(1234.5), "1234");
+        assert_eq!(significant(0.009_999_999), "0.0100");
         assert_eq!(significant(0.0), "0");
     }
 }

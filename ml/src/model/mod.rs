@@ -12,6 +12,7 @@
 pub mod write;
 pub mod weights;
 pub mod card;
+pub mod onnx;
 
 use crate::predict::Predictor;
 use hydroflex_openapi::model::{MODEL_FORMAT_VERSION, ModelConfig};

@@ -67,6 +67,7 @@ pub fn write_model(
         ("README.md", card::card(&config).into_bytes()),
         ("auxiliary.safetensors", auxiliary.to_file().map_err(tensors)?),
         ("config.json", to_json(&config)),
+        ("model.onnx", super::onnx::to_onnx(&config, &weights)),
         (
             "model.safetensors",
             weights.to_file(&config.layers).map_err(tensors)?,

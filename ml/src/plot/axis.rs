@@ -26,7 +26,11 @@ impl Axis {
         let step = round_step((self.max - self.min) / count as f64);
         let first = (self.min / step - 1e-9).ceil();
         let last = (self.max / step + 1e-9).floor();
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a handful of ticks")]
+        #[allow(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a handful of ticks"
+        )]
         let steps = (last - first).max(0.0) as usize;
         (0..=steps).map(|i| (first + i as f64) * step).collect()
     }
@@ -38,16 +42,26 @@ fn round_step(step: f64) -> f64 {
         return 1.0;
     }
     let power = 10.0_f64.powf(step.log10().floor());
-    let factor = [1.0, 2.0, 5.0].into_iter().find(|f| f * power >= step * 0.999).unwrap_or(10.0);
+    let factor = [1.0, 2.0, 5.0]
+        .into_iter()
+        .find(|f| f * power >= step * 0.999)
+        .unwrap_or(10.0);
     factor * power
 }
 
 /// A tick's label with as many decimals as the distance between ticks needs, and a real minus.
 #[must_use]
 pub fn label(value: f64, step: f64) -> String {
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and 12")]
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and 12"
+    )]
     let decimals = (-step.log10().floor()).clamp(0.0, 12.0) as usize;
-    let text = format!("{:.decimals$}", if value.abs() < step * 1e-6 { 0.0 } else { value });
+    let text = format!(
+        "{:.decimals$}",
+        if value.abs() < step * 1e-6 { 0.0 } else { value }
+    );
     text.replace('-', "\u{2212}")
 }
 
@@ -62,7 +76,11 @@ pub fn padded_range<'a>(values: impl Iterator<Item = &'a f64>, margin: f64) -> (
     if low > high {
         return (-1.0, 1.0);
     }
-    let span = if high > low { high - low } else { high.abs().max(1e-12) };
+    let span = if high > low {
+        high - low
+    } else {
+        high.abs().max(1e-12)
+    };
     (low - margin * span, high + margin * span)
 }
 
@@ -72,7 +90,9 @@ pub fn padded_range<'a>(values: impl Iterator<Item = &'a f64>, margin: f64) -> (
 pub fn simplify(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     const TOLERANCE_PX: f64 = 0.12;
     const LONGEST: usize = 60;
-    let Some(&first) = points.first() else { return Vec::new() };
+    let Some(&first) = points.first() else {
+        return Vec::new();
+    };
     let mut kept = vec![first];
     let mut anchor = 0;
     for end in 1..points.len() {
@@ -97,7 +117,12 @@ mod tests {
 
     #[test]
     fn ticks_are_round_and_inside() {
-        let axis = Axis { min: -0.013, max: 0.021, start_px: 0.0, end_px: 100.0 };
+        let axis = Axis {
+            min: -0.013,
+            max: 0.021,
+            start_px: 0.0,
+            end_px: 100.0,
+        };
         let ticks = axis.ticks(4);
         assert_eq!(ticks.len(), 4, "{ticks:?}");
         assert!((ticks[0] + 0.01).abs() < 1e-12 && (ticks[3] - 0.02).abs() < 1e-12);

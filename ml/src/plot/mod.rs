@@ -83,7 +83,11 @@ pub fn of_run(
     };
     let targets = runs.select(&names(&config.targets))?;
     let inputs = runs.select(&names(&config.inputs))?;
-    let position = runs.runs.iter().position(|r| r.run_id == evaluated.run_id).unwrap_or(0);
+    let position = runs
+        .runs
+        .iter()
+        .position(|r| r.run_id == evaluated.run_id)
+        .unwrap_or(0);
     let samples = &targets.runs[position];
     let first_row = config.window_steps - 1;
     let predictor = model.predictor();
@@ -95,7 +99,10 @@ pub fn of_run(
             let unit = display_unit(&channel.name);
             let factor = unit.map_or(1.0, |u| u.factor);
             let scaled = |values: &[f64]| -> Vec<f64> { values.iter().map(|v| v * factor).collect() };
-            let half_width = evaluated.estimate[t].iter().map(|&e| predictor.half_width(t, e).map(|h| h * factor)).collect();
+            let half_width = evaluated.estimate[t]
+                .iter()
+                .map(|&e| predictor.half_width(t, e).map(|h| h * factor))
+                .collect();
             PictureRow {
                 name: readable(&channel.name),
                 unit: unit.map_or(channel.unit.as_str(), |u| u.label).to_owned(),
@@ -123,7 +130,9 @@ pub fn of_run(
             config.inputs.len(),
             config.provenance.train_runs,
         ),
-        time_s: (0..samples.len()).map(|row| row as f64 * runs.sample_time_s).collect(),
+        time_s: (0..samples.len())
+            .map(|row| row as f64 * runs.sample_time_s)
+            .collect(),
         first_row,
         commands,
         rows,
@@ -134,20 +143,35 @@ pub fn of_run(
 fn readable(name: &str) -> String {
     let parts: Vec<&str> = name.split('_').collect();
     let text = match parts.as_slice() {
-        [quantity @ ("deflection" | "strain" | "stress"), place, component, ..] => format!("{place} {quantity} {component}"),
+        [
+            quantity @ ("deflection" | "strain" | "stress"),
+            place,
+            component,
+            ..,
+        ] => format!("{place} {quantity} {component}"),
         ["valve", cylinder, ..] => format!("{cylinder} valve"),
         _ => name.to_owned(),
     };
     let mut letters = text.chars();
-    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+    letters
+        .next()
+        .map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
 }
 
 impl Picture {
     /// Height of the drawing, px.
     fn height(&self) -> f64 {
-        let commands = if self.commands.is_empty() { 0.0 } else { COMMAND_HEIGHT + ROW_GAP };
+        let commands = if self.commands.is_empty() {
+            0.0
+        } else {
+            COMMAND_HEIGHT + ROW_GAP
+        };
         let rows = self.rows.len() as f64;
-        HEADER + commands + rows * (SIGNAL_HEIGHT + INNER_GAP + ERROR_HEIGHT) + (rows - 1.0).max(0.0) * ROW_GAP + FOOTER
+        HEADER
+            + commands
+            + rows * (SIGNAL_HEIGHT + INNER_GAP + ERROR_HEIGHT)
+            + (rows - 1.0).max(0.0) * ROW_GAP
+            + FOOTER
     }
 
     /// The picture as an SVG document.
@@ -191,8 +215,16 @@ impl Picture {
     }
 
     fn header(&self, svg: &mut String) -> std::fmt::Result {
-        writeln!(svg, "<text x=\"{LEFT}\" y=\"34\" font-size=\"20\" font-weight=\"600\">{}</text>", escape(&self.title))?;
-        writeln!(svg, "<text x=\"{LEFT}\" y=\"56\" fill=\"{QUIET}\">{}</text>", escape(&self.subtitle))?;
+        writeln!(
+            svg,
+            "<text x=\"{LEFT}\" y=\"34\" font-size=\"20\" font-weight=\"600\">{}</text>",
+            escape(&self.title)
+        )?;
+        writeln!(
+            svg,
+            "<text x=\"{LEFT}\" y=\"56\" fill=\"{QUIET}\">{}</text>",
+            escape(&self.subtitle)
+        )?;
         let entries = [
             (REFERENCE, 5.0, "simulation (reference)"),
             (ESTIMATE, 1.6, "network (estimate), and its error"),
@@ -213,7 +245,12 @@ impl Picture {
     }
 
     fn command_strip(&self, svg: &mut String, time: &Axis, top: f64) -> std::fmt::Result {
-        let value = Axis { min: -1.1, max: 1.1, start_px: top + COMMAND_HEIGHT, end_px: top };
+        let value = Axis {
+            min: -1.1,
+            max: 1.1,
+            start_px: top + COMMAND_HEIGHT,
+            end_px: top,
+        };
         frame(svg, time, &value, top, COMMAND_HEIGHT, &[-1.0, 0.0, 1.0], 1.0)?;
         axis_title(svg, top + COMMAND_HEIGHT / 2.0, "Valve", "")?;
         for (_, column) in &self.commands {
@@ -224,7 +261,12 @@ impl Picture {
 
     fn signal_panel(&self, svg: &mut String, time: &Axis, row: &PictureRow, top: f64) -> std::fmt::Result {
         let (min, max) = padded_range(row.reference.iter().chain(&row.estimate), 0.08);
-        let value = Axis { min, max, start_px: top + SIGNAL_HEIGHT, end_px: top };
+        let value = Axis {
+            min,
+            max,
+            start_px: top + SIGNAL_HEIGHT,
+            end_px: top,
+        };
         let ticks = value.ticks(5);
         frame(svg, time, &value, top, SIGNAL_HEIGHT, &ticks, tick_step(&ticks))?;
         axis_title(svg, top + SIGNAL_HEIGHT / 2.0, &row.name, &row.unit)?;
@@ -235,10 +277,21 @@ impl Picture {
 
     fn error_panel(&self, svg: &mut String, time: &Axis, row: &PictureRow, top: f64) -> std::fmt::Result {
         let reference = &row.reference[self.first_row.min(row.reference.len())..];
-        let error = |estimate: &[f64]| -> Vec<f64> { estimate.iter().zip(reference).map(|(e, r)| e - r).collect() };
+        let error =
+            |estimate: &[f64]| -> Vec<f64> { estimate.iter().zip(reference).map(|(e, r)| e - r).collect() };
         let (network, linear) = (error(&row.estimate), error(&row.least_squares));
-        let largest = network.iter().chain(&linear).fold(0.0_f64, |m, e| m.max(e.abs())).max(1e-12) * 1.12;
-        let value = Axis { min: -largest, max: largest, start_px: top + ERROR_HEIGHT, end_px: top };
+        let largest = network
+            .iter()
+            .chain(&linear)
+            .fold(0.0_f64, |m, e| m.max(e.abs()))
+            .max(1e-12)
+            * 1.12;
+        let value = Axis {
+            min: -largest,
+            max: largest,
+            start_px: top + ERROR_HEIGHT,
+            end_px: top,
+        };
         let ticks = value.ticks(4);
         frame(svg, time, &value, top, ERROR_HEIGHT, &ticks, tick_step(&ticks))?;
         axis_title(svg, top + ERROR_HEIGHT / 2.0, "Error", &row.unit)?;
@@ -260,10 +313,22 @@ impl Picture {
     }
 
     /// Shades the samples before the first whole window.
-    fn blind_part(&self, svg: &mut String, time: &Axis, top: f64, height: f64, text: &str) -> std::fmt::Result {
-        let Some(&end) = self.time_s.get(self.first_row) else { return Ok(()) };
+    fn blind_part(
+        &self,
+        svg: &mut String,
+        time: &Axis,
+        top: f64,
+        height: f64,
+        text: &str,
+    ) -> std::fmt::Result {
+        let Some(&end) = self.time_s.get(self.first_row) else {
+            return Ok(());
+        };
         let width = time.px(end) - LEFT;
-        writeln!(svg, "<rect x=\"{LEFT}\" y=\"{top}\" width=\"{width:.1}\" height=\"{height}\" fill=\"#7b8794\" opacity=\"0.10\"/>")?;
+        writeln!(
+            svg,
+            "<rect x=\"{LEFT}\" y=\"{top}\" width=\"{width:.1}\" height=\"{height}\" fill=\"#7b8794\" opacity=\"0.10\"/>"
+        )?;
         if text.is_empty() || width < 14.0 {
             return Ok(());
         }
@@ -285,8 +350,13 @@ impl Picture {
         color: &str,
         width: f64,
     ) -> std::fmt::Result {
-        let points: Vec<(f64, f64)> =
-            self.time_s.iter().skip(first_row).zip(column).map(|(&t, &v)| (time.px(t), value.px(v))).collect();
+        let points: Vec<(f64, f64)> = self
+            .time_s
+            .iter()
+            .skip(first_row)
+            .zip(column)
+            .map(|(&t, &v)| (time.px(t), value.px(v)))
+            .collect();
         write!(
             svg,
             "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" stroke-linejoin=\"round\" stroke-linecap=\"round\" points=\""
@@ -309,7 +379,11 @@ impl Picture {
             )?;
         }
         let middle = (LEFT + WIDTH - RIGHT) / 2.0;
-        writeln!(svg, "<text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">Time [s]</text>", bottom + 40.0)
+        writeln!(
+            svg,
+            "<text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">Time [s]</text>",
+            bottom + 40.0
+        )
     }
 }
 
@@ -318,16 +392,31 @@ fn tick_step(ticks: &[f64]) -> f64 {
 }
 
 /// Grid, value labels and border of a panel.
-fn frame(svg: &mut String, time: &Axis, value: &Axis, top: f64, height: f64, ticks: &[f64], step: f64) -> std::fmt::Result {
+fn frame(
+    svg: &mut String,
+    time: &Axis,
+    value: &Axis,
+    top: f64,
+    height: f64,
+    ticks: &[f64],
+    step: f64,
+) -> std::fmt::Result {
     let right = WIDTH - RIGHT;
     for tick in time.ticks(10) {
         let x = time.px(tick);
-        writeln!(svg, "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{top}\" y2=\"{}\" stroke=\"{GRID}\"/>", top + height)?;
+        writeln!(
+            svg,
+            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{top}\" y2=\"{}\" stroke=\"{GRID}\"/>",
+            top + height
+        )?;
     }
     for &tick in ticks {
         let y = value.px(tick);
         let stroke = if tick.abs() < step * 1e-6 { "#b8c1cb" } else { GRID };
-        writeln!(svg, "<line x1=\"{LEFT}\" x2=\"{right}\" y1=\"{y:.1}\" y2=\"{y:.1}\" stroke=\"{stroke}\"/>")?;
+        writeln!(
+            svg,
+            "<line x1=\"{LEFT}\" x2=\"{right}\" y1=\"{y:.1}\" y2=\"{y:.1}\" stroke=\"{stroke}\"/>"
+        )?;
         writeln!(
             svg,
             "<text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\" font-size=\"12\" fill=\"{QUIET}\">{}</text>",
@@ -346,7 +435,11 @@ fn frame(svg: &mut String, time: &Axis, value: &Axis, top: f64, height: f64, tic
 /// Name and unit along the value axis.
 fn axis_title(svg: &mut String, middle: f64, name: &str, unit: &str) -> std::fmt::Result {
     let x = 22.0;
-    let text = if unit.is_empty() { escape(name) } else { format!("{} [{}]", escape(name), escape(unit)) };
+    let text = if unit.is_empty() {
+        escape(name)
+    } else {
+        format!("{} [{}]", escape(name), escape(unit))
+    };
     writeln!(
         svg,
         "<text x=\"{x}\" y=\"{middle:.1}\" text-anchor=\"middle\" font-size=\"12\" transform=\"rotate(-90 {x} {middle:.1})\">{text}</text>"
@@ -354,7 +447,9 @@ fn axis_title(svg: &mut String, middle: f64, name: &str, unit: &str) -> std::fmt
 }
 
 fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
 }
 
 #[cfg(test)]

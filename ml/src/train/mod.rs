@@ -103,9 +103,12 @@ pub enum TrainError {
     },
     /// The data set does not say how long a window is.
     #[error(
-        "the data set has no settling runs from which the window length could follow; give the window in seconds"
+        "the data set does not tell the window length by this rule (no settling runs, or none that settles); give the window in seconds"
     )]
     NoWindow,
+    /// The data set cannot be read.
+    #[error(transparent)]
+    Dataset(#[from] hydroflex_dataset::OpenError),
     /// Too few runs.
     #[error(
         "{train} training and {validation} validation runs are too few: at least {} and 1 are needed",
@@ -141,6 +144,21 @@ pub enum TrainError {
     /// The model folder cannot be written.
     #[error(transparent)]
     Model(#[from] ModelError),
+}
+
+/// Trains a network on a data set; see [`train`].
+///
+/// # Errors
+/// As [`train`], or the data set cannot be read.
+pub fn train_dataset(
+    dataset: &hydroflex_dataset::Dataset,
+    spec: &TrainingSpec,
+    progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    checkpoint_dir: &Path,
+    out_dir: &Path,
+) -> Result<ModelSummary, TrainError> {
+    let (data, spec) = crate::dataset::training_data(dataset, spec)?;
+    train(&data, &spec, progress, checkpoint_dir, out_dir)
 }
 
 /// Trains a network and writes its model folder to `out_dir`.

@@ -1,6 +1,15 @@
 //! `hydroflex evaluate`: a model against a data set it has not seen.
 
-use std::path::PathBuf;
+use anyhow::Context as _;
+use hydroflex_dataset::Dataset;
+use hydroflex_ml::dataset::evaluation_runs;
+use hydroflex_ml::evaluate::evaluate;
+use hydroflex_ml::evaluate::table::{PUBLISHED, table};
+use hydroflex_ml::model::Model;
+use hydroflex_ml::plot::of_run;
+use hydroflex_openapi::model::EvaluationReport;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `hydroflex evaluate`.
 #[derive(Debug, clap::Args)]
@@ -26,6 +35,70 @@ pub struct Args {
 ///
 /// # Errors
 /// Every failure ends the command with its reason.
-pub fn run(_args: Args) -> anyhow::Result<()> {
-    anyhow::bail!("not wired yet")
+pub fn run(args: Args) -> anyhow::Result<()> {
+    let model = Model::load(&args.model).with_context(|| format!("cannot load {}", args.model.display()))?;
+    let dataset =
+        Dataset::open(&args.data).with_context(|| format!("cannot open {}", args.data.display()))?;
+    let seen = dataset.dataset_sha256() == model.config().provenance.dataset_sha256;
+    let runs = evaluation_runs(&dataset, &model)?;
+    let evaluation = evaluate(&model, &runs, dataset.dataset_sha256())
+        .with_context(|| format!("cannot evaluate on {}", args.data.display()))?;
+    if let Some(path) = &args.plot {
+        let run = match args.run {
+            Some(id) => evaluation
+                .runs
+                .iter()
+                .position(|run| run.run_id == id)
+                .with_context(|| format!("run {id} is not among the evaluated runs"))?,
+            None => 0,
+        };
+        let title = format!(
+            "{}: structural estimates from hydraulic signals",
+            machine_title(&dataset)
+        );
+        let picture = of_run(&model, &runs, &evaluation, run, &title)?;
+        std::fs::write(path, picture.to_svg()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    if args.json {
+        return super::print_json(&evaluation.report);
+    }
+    super::print_line(format_args!(
+        "{}",
+        describe(&evaluation.report, seen, args.plot.as_deref())
+    ))
+}
+
+/// `lift-boom` as a title: `Lift boom`.
+fn machine_title(dataset: &Dataset) -> String {
+    let name = dataset.manifest().machine.name.replace(['-', '_'], " ");
+    let mut letters = name.chars();
+    letters
+        .next()
+        .map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
+
+fn describe(report: &EvaluationReport, seen: bool, plot: Option<&Path>) -> String {
+    let mut text = format!("{} runs", report.runs);
+    if seen {
+        text.push_str(" of the model's own data set, not trained on");
+    }
+    if let Some(inside) = report.inside_envelope {
+        let _ = write!(
+            text,
+            ", {:.1} % of the windows inside the envelope",
+            100.0 * inside
+        );
+    }
+    text.push_str("\n\n");
+    text.push_str(&table(report));
+    text.push_str("\npublished for another boom (the paper's), MAE of the vertical deflection: ");
+    let published: Vec<String> = PUBLISHED
+        .iter()
+        .map(|p| format!("{:.3} mm at {:.0} kg", p.deflection_mae_mm, p.payload_kg))
+        .collect();
+    text.push_str(&published.join(", "));
+    if let Some(path) = plot {
+        let _ = write!(text, "\npicture: {}", path.display());
+    }
+    text
 }

@@ -1,6 +1,13 @@
 //! `hydroflex predict`: estimates for recorded signals.
 
-use std::path::PathBuf;
+use anyhow::Context as _;
+use hydroflex_dataset::Dataset;
+use hydroflex_ml::dataset::load_all;
+use hydroflex_ml::evaluate::check_sample_time;
+use hydroflex_ml::model::Model;
+use hydroflex_ml::recording::{predict_runs, read_parquet, write_predictions};
+use hydroflex_ml::runs::Runs;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `hydroflex predict`.
 #[derive(Debug, clap::Args)]
@@ -23,6 +30,38 @@ pub struct Args {
 ///
 /// # Errors
 /// Every failure ends the command with its reason.
-pub fn run(_args: Args) -> anyhow::Result<()> {
-    anyhow::bail!("not wired yet")
+pub fn run(args: Args) -> anyhow::Result<()> {
+    let model = Model::load(&args.model).with_context(|| format!("cannot load {}", args.model.display()))?;
+    let runs = read_signals(&args.data, &model)?;
+    check_sample_time(&model, runs.sample_time_s)?;
+    runs.check()?;
+    let table = predict_runs(&model, &runs);
+    write_predictions(&args.out, &table)?;
+    let rows = table.run_id.len();
+    let estimates = table
+        .targets
+        .first()
+        .map_or(0, |t| t.values.iter().flatten().count());
+    if args.json {
+        return super::print_json(&serde_json::json!({
+            "model_sha256": model.sha256(), "runs": runs.runs.len(), "rows": rows, "estimates": estimates,
+            "targets": table.targets.iter().map(|t| &t.name).collect::<Vec<_>>(), "out": args.out,
+        }));
+    }
+    super::print_line(format_args!(
+        "{} runs, {rows} rows, {estimates} with estimates (the first {} samples of a run have none): {}",
+        runs.runs.len(),
+        model.config().window_steps - 1,
+        args.out.display()
+    ))
+}
+
+/// The model's inputs from a recording or a data set directory.
+fn read_signals(path: &Path, model: &Model) -> anyhow::Result<Runs> {
+    let names: Vec<String> = model.config().inputs.iter().map(|c| c.name.clone()).collect();
+    if path.is_dir() {
+        let dataset = Dataset::open(path).with_context(|| format!("cannot open {}", path.display()))?;
+        return Ok(load_all(&dataset, &names)?);
+    }
+    Ok(read_parquet(path, &names, model.config().sample_time_s)?)
 }

@@ -1,0 +1,328 @@
+//! `model.onnx`: the network with its scales, for onnxruntime and whatever else reads ONNX.
+//!
+//! ```text
+//! window [batch, steps, inputs] f64 → scale → f32 → flatten → layers (+ skip) → f64 → unscale → estimates [batch, targets]
+//! ```
+//!
+//! Only the messages and fields that this graph needs are declared, with the numbers of
+//! `onnx.proto` (IR version 8, operator set 17).
+
+use super::weights::{LinearWeights, Weights};
+use hydroflex_openapi::model::{Activation, ModelConfig, ScaledChannel};
+use prost::Message;
+
+const IR_VERSION: i64 = 8;
+const OPSET_VERSION: i64 = 17;
+
+const FLOAT: i32 = 1;
+const INT64: i32 = 7;
+const DOUBLE: i32 = 11;
+
+const ATTRIBUTE_INT: i32 = 2;
+
+#[derive(Clone, PartialEq, Message)]
+struct ModelProto {
+    #[prost(int64, tag = "1")]
+    ir_version: i64,
+    #[prost(string, tag = "2")]
+    producer_name: String,
+    #[prost(string, tag = "3")]
+    producer_version: String,
+    #[prost(message, optional, tag = "7")]
+    graph: Option<GraphProto>,
+    #[prost(message, repeated, tag = "8")]
+    opset_import: Vec<OperatorSetId>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct OperatorSetId {
+    #[prost(string, tag = "1")]
+    domain: String,
+    #[prost(int64, tag = "2")]
+    version: i64,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct GraphProto {
+    #[prost(message, repeated, tag = "1")]
+    node: Vec<NodeProto>,
+    #[prost(string, tag = "2")]
+    name: String,
+    #[prost(message, repeated, tag = "5")]
+    initializer: Vec<TensorProto>,
+    #[prost(string, tag = "10")]
+    doc_string: String,
+    #[prost(message, repeated, tag = "11")]
+    input: Vec<ValueInfo>,
+    #[prost(message, repeated, tag = "12")]
+    output: Vec<ValueInfo>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct NodeProto {
+    #[prost(string, repeated, tag = "1")]
+    input: Vec<String>,
+    #[prost(string, repeated, tag = "2")]
+    output: Vec<String>,
+    #[prost(string, tag = "3")]
+    name: String,
+    #[prost(string, tag = "4")]
+    op_type: String,
+    #[prost(message, repeated, tag = "5")]
+    attribute: Vec<AttributeProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct AttributeProto {
+    #[prost(string, tag = "1")]
+    name: String,
+    #[prost(int64, tag = "3")]
+    i: i64,
+    #[prost(int32, tag = "20")]
+    kind: i32,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TensorProto {
+    #[prost(int64, repeated, tag = "1")]
+    dims: Vec<i64>,
+    #[prost(int32, tag = "2")]
+    data_type: i32,
+    #[prost(string, tag = "8")]
+    name: String,
+    #[prost(bytes = "vec", tag = "9")]
+    raw_data: Vec<u8>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct ValueInfo {
+    #[prost(string, tag = "1")]
+    name: String,
+    #[prost(message, optional, tag = "2")]
+    kind: Option<TypeProto>,
+    #[prost(string, tag = "3")]
+    doc_string: String,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TypeProto {
+    #[prost(message, optional, tag = "1")]
+    tensor_type: Option<TensorType>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TensorType {
+    #[prost(int32, tag = "1")]
+    elem_type: i32,
+    #[prost(message, optional, tag = "2")]
+    shape: Option<TensorShape>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TensorShape {
+    #[prost(message, repeated, tag = "1")]
+    dim: Vec<Dimension>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Dimension {
+    #[prost(oneof = "dimension::Value", tags = "1, 2")]
+    value: Option<dimension::Value>,
+}
+
+mod dimension {
+    #[derive(Clone, PartialEq, prost::Oneof)]
+    pub(super) enum Value {
+        #[prost(int64, tag = "1")]
+        DimValue(i64),
+        #[prost(string, tag = "2")]
+        DimParam(String),
+    }
+}
+
+/// Content of `model.onnx`.
+#[must_use]
+pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
+    let mut graph = Graph::default();
+    let window_values = config.window_steps * config.inputs.len();
+    let mut x = graph.scale_inputs(&config.inputs, window_values);
+    let flat = x.clone();
+    for (layer, map) in config.layers.iter().zip(&weights.layers) {
+        x = graph.gemm(&layer.name, &x, map);
+        for &activation in &layer.activations {
+            x = graph.activation(&x, activation);
+        }
+    }
+    if let Some(skip) = &weights.skip {
+        let linear = graph.gemm("skip", &flat, skip);
+        x = if config.layers.is_empty() {
+            linear
+        } else {
+            graph.node("Add", &[&x, &linear], Vec::new())
+        };
+    }
+    graph.unscale_outputs(&config.targets, &x);
+    let names = |channels: &[ScaledChannel]| {
+        channels
+            .iter()
+            .map(|c| c.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    let proto = ModelProto {
+        ir_version: IR_VERSION,
+        producer_name: "hydroflex".to_owned(),
+        producer_version: config.provenance.hydroflex_version.clone(),
+        opset_import: vec![OperatorSetId {
+            domain: String::new(),
+            version: OPSET_VERSION,
+        }],
+        graph: Some(GraphProto {
+            node: graph.nodes,
+            name: "slide".to_owned(),
+            initializer: graph.initializers,
+            doc_string: format!(
+                "SLIDE network: window of {} samples, oldest first; {} s between samples",
+                config.window_steps, config.sample_time_s
+            ),
+            input: vec![value_info(
+                "window",
+                &names(&config.inputs),
+                &[config.window_steps, config.inputs.len()],
+            )],
+            output: vec![value_info(
+                "estimates",
+                &names(&config.targets),
+                &[config.targets.len()],
+            )],
+        }),
+    };
+    proto.encode_to_vec()
+}
+
+/// Nodes and constants so far; values are named by the order of their making.
+#[derive(Default)]
+struct Graph {
+    nodes: Vec<NodeProto>,
+    initializers: Vec<TensorProto>,
+}
+
+impl Graph {
+    fn node(&mut self, op_type: &str, inputs: &[&str], attribute: Vec<AttributeProto>) -> String {
+        let output = format!("v{}", self.nodes.len());
+        self.named_node(op_type, inputs, attribute, output)
+    }
+
+    fn named_node(
+        &mut self,
+        op_type: &str,
+        inputs: &[&str],
+        attribute: Vec<AttributeProto>,
+        output: String,
+    ) -> String {
+        self.nodes.push(NodeProto {
+            input: inputs.iter().map(|&i| i.to_owned()).collect(),
+            output: vec![output.clone()],
+            name: format!("{}_{}", op_type.to_lowercase(), self.nodes.len()),
+            op_type: op_type.to_owned(),
+            attribute,
+        });
+        output
+    }
+
+    fn constant(&mut self, name: &str, data_type: i32, dims: &[usize], raw_data: Vec<u8>) -> String {
+        let dims = dims.iter().map(|&d| to_i64(d)).collect();
+        self.initializers.push(TensorProto {
+            dims,
+            data_type,
+            name: name.to_owned(),
+            raw_data,
+        });
+        name.to_owned()
+    }
+
+    fn doubles(&mut self, name: &str, values: impl Iterator<Item = f64>) -> String {
+        let raw: Vec<u8> = values.flat_map(f64::to_le_bytes).collect();
+        self.constant(name, DOUBLE, &[raw.len() / 8], raw)
+    }
+
+    fn scale_inputs(&mut self, channels: &[ScaledChannel], window_values: usize) -> String {
+        let offset = self.doubles("input_offset", channels.iter().map(|c| c.offset));
+        let scale = self.doubles("input_scale", channels.iter().map(|c| c.scale));
+        let flat = [-1, to_i64(window_values)]
+            .iter()
+            .flat_map(|d: &i64| d.to_le_bytes())
+            .collect();
+        let shape = self.constant("window_shape", INT64, &[2], flat);
+        let centred = self.node("Sub", &["window", &offset], Vec::new());
+        let scaled = self.node("Div", &[&centred, &scale], Vec::new());
+        let single = self.node("Cast", &[&scaled], vec![integer("to", i64::from(FLOAT))]);
+        self.node("Reshape", &[&single, &shape], Vec::new())
+    }
+
+    fn unscale_outputs(&mut self, channels: &[ScaledChannel], x: &str) {
+        let offset = self.doubles("target_offset", channels.iter().map(|c| c.offset));
+        let scale = self.doubles("target_scale", channels.iter().map(|c| c.scale));
+        let double = self.node("Cast", &[x], vec![integer("to", i64::from(DOUBLE))]);
+        let scaled = self.node("Mul", &[&double, &scale], Vec::new());
+        self.named_node("Add", &[&scaled, &offset], Vec::new(), "estimates".to_owned());
+    }
+
+    fn gemm(&mut self, name: &str, x: &str, map: &LinearWeights) -> String {
+        let outputs = map.bias.len();
+        let raw = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let dims = [outputs, map.weight.len() / outputs.max(1)];
+        let weight = self.constant(&format!("{name}.weight"), FLOAT, &dims, raw(&map.weight));
+        let bias = self.constant(&format!("{name}.bias"), FLOAT, &[outputs], raw(&map.bias));
+        self.node("Gemm", &[x, &weight, &bias], vec![integer("transB", 1)])
+    }
+
+    fn activation(&mut self, x: &str, activation: Activation) -> String {
+        match activation {
+            Activation::Tanh => self.node("Tanh", &[x], Vec::new()),
+            Activation::Sigmoid => self.node("Sigmoid", &[x], Vec::new()),
+            Activation::Relu => self.node("Relu", &[x], Vec::new()),
+            Activation::Elu => self.node("Elu", &[x], Vec::new()),
+            Activation::Silu => {
+                let gate = self.node("Sigmoid", &[x], Vec::new());
+                self.node("Mul", &[x, &gate], Vec::new())
+            }
+        }
+    }
+}
+
+fn integer(name: &str, i: i64) -> AttributeProto {
+    AttributeProto {
+        name: name.to_owned(),
+        i,
+        kind: ATTRIBUTE_INT,
+    }
+}
+
+fn to_i64(value: usize) -> i64 {
+    i64::try_from(value).unwrap_or(i64::MAX)
+}
+
+/// A tensor of doubles whose first dimension is the batch.
+fn value_info(name: &str, doc_string: &str, dims: &[usize]) -> ValueInfo {
+    let batch = Dimension {
+        value: Some(dimension::Value::DimParam("batch".to_owned())),
+    };
+    let fixed = dims.iter().map(|&d| Dimension {
+        value: Some(dimension::Value::DimValue(to_i64(d))),
+    });
+    let shape = TensorShape {
+        dim: std::iter::once(batch).chain(fixed).collect(),
+    };
+    let tensor_type = TensorType {
+        elem_type: DOUBLE,
+        shape: Some(shape),
+    };
+    ValueInfo {
+        name: name.to_owned(),
+        kind: Some(TypeProto {
+            tensor_type: Some(tensor_type),
+        }),
+        doc_string: doc_string.to_owned(),
+    }
+}
