@@ -173,6 +173,8 @@ pub enum Integrator {
     #[default]
     Accurate,
     /// The published scripts' scheme: Newmark β = 1/4, γ = 1/2 with velocity-level constraints.
+    // As on the command line; serde's kebab case would write `trapezoidal-index2`.
+    #[serde(rename = "trapezoidal-index-2")]
     TrapezoidalIndex2 {
         /// Step.
         #[serde(default = "default_sample_time_s")]

@@ -4,6 +4,7 @@ use crate::machines::ReadyMachine;
 use crate::run;
 use bytes::Bytes;
 use hydroflex_dataset::{RunKind, RunRecord, ShardError, ShardSchema, ShardWriter};
+use hydroflex_ledger::crash::crash_point_of;
 use hydroflex_ledger::{Claim, ShardKind};
 use hydroflex_openapi::job::{JobSpec, RunStatus};
 use hydroflex_openapi::status::TimeSplit;
@@ -145,6 +146,7 @@ fn simulate(
     if control.stop.load(Ordering::Relaxed) {
         return Err(ShardFailure::Stopped);
     }
+    crash_point_of("run", index);
     let planned = run::plan(spec, machine, kind, index).map_err(|source| ShardFailure::Plan {
         run_id: index,
         source,

@@ -32,6 +32,14 @@ fn plan() -> Option<&'static Plan> {
     .as_ref()
 }
 
+/// Passes the point `NAME-NUMBER`, such as the beginning of a run.
+pub fn crash_point_of(name: &str, number: u64) {
+    // Formatted only where a test has set a plan: this is called for every run.
+    if plan().is_some() {
+        crash_point(&format!("{name}-{number}"));
+    }
+}
+
 /// Passes a point; returns unless the environment asks for a death here.
 pub fn crash_point(point: &str) {
     let Some(plan) = plan().filter(|plan| plan.point == point) else {

@@ -1,5 +1,6 @@
 //! `hydroflex worker`: one worker process.
 
+use crate::coordinator::train::{self, TrainerConfig};
 use crate::service;
 use anyhow::Context;
 use hydroflex_worker::lifetime;
@@ -103,7 +104,12 @@ async fn work(args: Args) -> anyhow::Result<()> {
             }
         }
         Role::Train => {
-            anyhow::bail!("not wired yet")
+            let config = TrainerConfig {
+                database: args.database,
+                store: args.store,
+                cache,
+            };
+            train::work(config, told).await
         }
     }
 }

@@ -6,6 +6,7 @@
 pub mod machines;
 pub mod plan;
 pub mod publish;
+pub mod train;
 pub mod supervise;
 pub mod watch;
 

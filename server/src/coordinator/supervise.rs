@@ -19,9 +19,9 @@ use std::time::{Duration, Instant};
 const LOOK: Duration = Duration::from_millis(50);
 /// Pause before a child that ended early is started again; doubled each time up to the longest.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// A child that lived this long has started well: the next pause is the first one again.
-const SETTLED: Duration = Duration::from_secs(20);
+const SETTLED: Duration = Duration::from_secs(5);
 /// Time to give a shard back before a child is killed.
 const GRACE: Duration = Duration::from_secs(5);
 
@@ -111,6 +111,7 @@ fn supervise(config: &SuperviseConfig, stop: &AtomicBool, restarts: &AtomicU64) 
         due: now,
     };
     let mut slots: Vec<Slot> = (0..config.workers).map(|_| slot("simulate")).collect();
+    slots.push(slot("train"));
     let mut started = 0_u64;
     let initial = slots.len() as u64;
     while !stop.load(Ordering::Relaxed) {
