@@ -2,7 +2,7 @@
 
 use crate::fe::{assemble_mass, assemble_stiffness};
 use crate::machine::FlexibleBody;
-use crate::reduction::{ReducedBody, ReductionError, free_free_hz};
+use crate::reduction::{ReducedBody, ReductionError, clamped_hz, free_free_hz};
 use crate::simulator::{Simulator, SimulatorError};
 use hydroflex_openapi::machine::{BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, PayloadSpec};
 use nalgebra::{DMatrix, Matrix3, Vector3};
@@ -13,6 +13,9 @@ const EQUILIBRIUM_POINTS: usize = 7;
 
 /// Free-free frequencies shown.
 const FREE_FREE_COUNT: usize = 6;
+
+/// Frequencies of the full model shown beside the reduced ones.
+const FULL_COUNT: usize = 4;
 
 /// Why a machine cannot be summarised.
 #[derive(Debug, thiserror::Error)]
@@ -105,6 +108,8 @@ pub struct BasisSummary {
     pub fixed_interface_hz: Vec<f64>,
     /// Frequencies of the reduced body with its first interface clamped.
     pub reduced_hz: Vec<f64>,
+    /// The same of the full model, as many as the reduction is meant to keep: what it lost.
+    pub full_hz: Vec<f64>,
 }
 
 /// A configuration at rest.
@@ -176,12 +181,17 @@ fn flexible_summary(
     body: &FlexibleBody,
 ) -> Result<BodySummary, SummaryError> {
     let without = &simulator.reduced(false)?[index];
-    let mut bases = vec![basis(without, false)];
-    if body.boundary_with_payload != body.boundary_without_payload {
-        bases.push(basis(&simulator.reduced(true)?[index], true));
-    }
     let stiffness = assemble_stiffness(&body.mesh, &body.material);
     let mass = assemble_mass(&body.mesh, &body.material, body.mass_kind);
+    let mut is_fixed = vec![false; body.mesh.node_count()];
+    for node in &body.interfaces[0].nodes {
+        is_fixed[*node as usize] = true;
+    }
+    let full_hz = clamped_hz(&stiffness, &mass, &is_fixed, FULL_COUNT)?;
+    let mut bases = vec![basis(without, false, &full_hz)];
+    if body.boundary_with_payload != body.boundary_without_payload {
+        bases.push(basis(&simulator.reduced(true)?[index], true, &full_hz));
+    }
     // the free body's first bending lies a few times above the clamped one
     let scale_hz = 3.0 * without.report.fixed_interface_hz.first().unwrap_or(&30.0);
     let com = without.centre_of_mass_m;
@@ -220,13 +230,14 @@ fn flexible_summary(
     })
 }
 
-fn basis(body: &ReducedBody, with_payload: bool) -> BasisSummary {
+fn basis(body: &ReducedBody, with_payload: bool, full_hz: &[f64]) -> BasisSummary {
     BasisSummary {
         with_payload,
         boundaries: body.report.boundary_names.clone(),
         mode_count: body.mode_count(),
         fixed_interface_hz: body.report.fixed_interface_hz.clone(),
         reduced_hz: generalised_hz(&body.stiffness_modal, &body.mass_modal),
+        full_hz: full_hz.to_vec(),
     }
 }
 

@@ -61,6 +61,20 @@ pub struct Mesh {
     pub(super) element_sets: BTreeMap<String, Vec<u32>>,
 }
 
+/// Corners of the four faces, seen from outside in positive order.
+const FACES: [[usize; 3]; 4] = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]];
+
+/// A face of an element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct ElementFace {
+    /// Corner nodes, ascending.
+    pub(super) nodes: [u32; 3],
+    /// Element.
+    pub(super) element: usize,
+    /// Which corners of the element, seen from outside in positive order.
+    pub(super) corners: [usize; 3],
+}
+
 /// What is wrong with a mesh as a whole. Labels are those of the file.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MeshDefect {
@@ -93,6 +107,26 @@ pub enum MeshDefect {
         /// Elements of the smallest part.
         part_elements: usize,
         /// An element of it, by label.
+        element: u64,
+    },
+    /// Parts that share nodes but can turn against each other: the stiffness would be singular.
+    #[error(
+        "the mesh falls into {parts} parts that hang together by edges or single nodes only; one of {part_elements} elements holds element {element}"
+    )]
+    Hinged {
+        /// Number of parts.
+        parts: usize,
+        /// Elements of the smallest part.
+        part_elements: usize,
+        /// An element of it, by label.
+        element: u64,
+    },
+    /// More than two elements on one face.
+    #[error("{count} elements share one face, among them element {element}")]
+    CrowdedFace {
+        /// How many.
+        count: usize,
+        /// One of them, by label.
         element: u64,
     },
 }
@@ -174,7 +208,26 @@ impl Mesh {
         (offsets, attached)
     }
 
-    /// Checks what a stiffness matrix needs: valid elements, no loose node, one piece.
+    /// All faces of all elements, equal ones side by side.
+    pub(super) fn sorted_faces(&self) -> Vec<ElementFace> {
+        let mut faces = Vec::with_capacity(4 * self.elements.len());
+        for element in 0..self.elements.len() {
+            let of_element = self.elements.nodes(element);
+            for corners in FACES {
+                let mut nodes = corners.map(|c| of_element[c]);
+                nodes.sort_unstable();
+                faces.push(ElementFace {
+                    nodes,
+                    element,
+                    corners,
+                });
+            }
+        }
+        faces.sort_unstable();
+        faces
+    }
+
+    /// Checks what a stiffness matrix needs: valid elements, no loose node, one rigid piece.
     ///
     /// # Errors
     /// The first defect found.
@@ -183,7 +236,7 @@ impl Mesh {
             Elements::Tet4(elements) => self.check_determinants::<4, Tet4>(elements)?,
             Elements::Tet10(elements) => self.check_determinants::<10, Tet10>(elements)?,
         }
-        let (offsets, attached) = self.attached_elements();
+        let (offsets, _) = self.attached_elements();
         let loose = |node: &usize| offsets[*node] == offsets[*node + 1];
         if let Some(node) = (0..self.node_count()).find(loose) {
             return Err(MeshDefect::LooseNode {
@@ -191,7 +244,7 @@ impl Mesh {
                 count: (node..self.node_count()).filter(loose).count(),
             });
         }
-        self.check_connected(&offsets, &attached)
+        self.check_connected()
     }
 
     fn check_determinants<const N: usize, E: Tetrahedron<N>>(
@@ -211,39 +264,126 @@ impl Mesh {
         Ok(())
     }
 
-    fn check_connected(&self, offsets: &[u32], attached: &[u32]) -> Result<(), MeshDefect> {
-        let count = self.elements.len();
-        let mut part_of = vec![usize::MAX; count];
-        let mut sizes: Vec<(usize, usize)> = Vec::new(); // (elements, first element)
-        let mut stack = Vec::new();
-        for seed in 0..count {
-            if part_of[seed] != usize::MAX {
-                continue;
+    /// Elements that share a face are one part, and so are parts that share three nodes off a line:
+    /// what is left over after that can move without strain.
+    fn check_connected(&self) -> Result<(), MeshDefect> {
+        let mut parts = Parts::singles(self.elements.len());
+        for same in self.sorted_faces().chunk_by(|a, b| a.nodes == b.nodes) {
+            if same.len() > 2 {
+                return Err(MeshDefect::CrowdedFace {
+                    count: same.len(),
+                    element: self.element_labels[same[0].element],
+                });
             }
-            let part = sizes.len();
-            sizes.push((0, seed));
-            part_of[seed] = part;
-            stack.push(seed);
-            while let Some(element) = stack.pop() {
-                sizes[part].0 += 1;
-                for &node in self.elements.nodes(element) {
-                    let range = offsets[node as usize] as usize..offsets[node as usize + 1] as usize;
-                    for &next in &attached[range] {
-                        if part_of[next as usize] == usize::MAX {
-                            part_of[next as usize] = part;
-                            stack.push(next as usize);
-                        }
-                    }
+            for pair in same.windows(2) {
+                parts.join(pair[0].element, pair[1].element);
+            }
+        }
+        while self.join_rigidly(&mut parts) {}
+        let sizes = parts.sizes();
+        let Some(&(part_elements, element)) = sizes.iter().min().filter(|_| sizes.len() > 1) else {
+            return Ok(());
+        };
+        let element = self.element_labels[element];
+        let shares_nodes = !self.shared_nodes(&mut parts).is_empty();
+        let parts = sizes.len();
+        Err(if shares_nodes {
+            MeshDefect::Hinged {
+                parts,
+                part_elements,
+                element,
+            }
+        } else {
+            MeshDefect::Disconnected {
+                parts,
+                part_elements,
+                element,
+            }
+        })
+    }
+
+    /// Nodes shared by pairs of parts.
+    fn shared_nodes(&self, parts: &mut Parts) -> BTreeMap<(usize, usize), Vec<u32>> {
+        let mut touching: Vec<(u32, usize)> = Vec::new();
+        for element in 0..self.elements.len() {
+            let part = parts.of(element);
+            touching.extend(self.elements.nodes(element).iter().map(|node| (*node, part)));
+        }
+        touching.sort_unstable();
+        touching.dedup();
+        let mut shared: BTreeMap<_, Vec<u32>> = BTreeMap::new();
+        for same in touching.chunk_by(|a, b| a.0 == b.0) {
+            for (i, a) in same.iter().enumerate() {
+                for b in &same[i + 1..] {
+                    shared.entry((a.1, b.1)).or_default().push(a.0);
                 }
             }
         }
-        match sizes.iter().min() {
-            Some(&(part_elements, element)) if sizes.len() > 1 => Err(MeshDefect::Disconnected {
-                parts: sizes.len(),
-                part_elements,
-                element: self.element_labels[element],
-            }),
-            _ => Ok(()),
+        shared
+    }
+
+    /// Joins parts that share three nodes off a line; whether any were.
+    fn join_rigidly(&self, parts: &mut Parts) -> bool {
+        let mut joined = false;
+        for ((a, b), nodes) in self.shared_nodes(parts) {
+            if !self.on_a_line(&nodes) {
+                joined |= parts.join(a, b);
+            }
         }
+        joined
+    }
+
+    fn on_a_line(&self, nodes: &[u32]) -> bool {
+        let position = |node: &u32| self.nodes_m[*node as usize];
+        let [first, rest @ ..] = nodes else {
+            return true;
+        };
+        let first = position(first);
+        let longest = rest
+            .iter()
+            .map(|node| position(node) - first)
+            .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()));
+        let Some(longest) = longest else { return true };
+        let off_line = |node: &u32| (position(node) - first).cross(&longest).norm();
+        // an angle of 1e-6 rad is no lever for any material
+        rest.iter()
+            .all(|node| off_line(node) <= 1e-6 * longest.norm_squared())
+    }
+}
+
+/// Disjoint sets of elements.
+struct Parts {
+    parent: Vec<usize>,
+}
+
+impl Parts {
+    fn singles(count: usize) -> Self {
+        Self {
+            parent: (0..count).collect(),
+        }
+    }
+
+    /// Smallest element of the part.
+    fn of(&mut self, mut element: usize) -> usize {
+        while self.parent[element] != element {
+            self.parent[element] = self.parent[self.parent[element]];
+            element = self.parent[element];
+        }
+        element
+    }
+
+    fn join(&mut self, a: usize, b: usize) -> bool {
+        let (a, b) = (self.of(a), self.of(b));
+        self.parent[a.max(b)] = a.min(b);
+        a != b
+    }
+
+    /// (elements, smallest element) of every part.
+    fn sizes(&mut self) -> Vec<(usize, usize)> {
+        let mut sizes = BTreeMap::new();
+        for element in 0..self.parent.len() {
+            *sizes.entry(self.of(element)).or_insert(0) += 1;
+        }
+        sizes.into_iter().map(|(part, size)| (size, part)).collect()
     }
 }

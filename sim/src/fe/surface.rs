@@ -1,7 +1,7 @@
 //! The surface of a mesh as triangles.
 
 use super::element::EDGES;
-use super::mesh::{Elements, Mesh};
+use super::mesh::{ElementFace, Elements, Mesh};
 use nalgebra::Vector3;
 
 /// Surface triangles with outward orientation. A quadratic facet counts as four triangles over its
@@ -11,34 +11,16 @@ pub struct Surface {
     triangles: Vec<[u32; 3]>,
 }
 
-/// Corners of the four faces, seen from outside in positive order.
-const FACES: [[usize; 3]; 4] = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]];
-
 impl Surface {
     /// Facets that belong to exactly one element.
     #[must_use]
     pub fn of(mesh: &Mesh) -> Self {
-        let elements = mesh.elements();
-        // (sorted corners, element, face)
-        let mut faces = Vec::with_capacity(4 * elements.len());
-        for e in 0..elements.len() {
-            let nodes = elements.nodes(e);
-            for (f, corners) in FACES.iter().enumerate() {
-                let mut key = corners.map(|c| nodes[c]);
-                key.sort_unstable();
-                faces.push((key, e, f));
-            }
-        }
-        faces.sort_unstable();
+        let faces = mesh.sorted_faces();
         let mut triangles = Vec::new();
-        let mut i = 0;
-        while i < faces.len() {
-            let same = faces[i..].iter().take_while(|f| f.0 == faces[i].0).count();
-            if same == 1 {
-                let (_, e, f) = faces[i];
-                push_facet(elements, e, FACES[f], &mut triangles);
+        for same in faces.chunk_by(|a, b| a.nodes == b.nodes) {
+            if let [face] = same {
+                push_facet(mesh.elements(), face, &mut triangles);
             }
-            i += same;
         }
         Self { triangles }
     }
@@ -68,9 +50,9 @@ impl Surface {
     }
 }
 
-fn push_facet(elements: &Elements, e: usize, face: [usize; 3], triangles: &mut Vec<[u32; 3]>) {
-    let nodes = elements.nodes(e);
-    let [a, b, c] = face;
+fn push_facet(elements: &Elements, face: &ElementFace, triangles: &mut Vec<[u32; 3]>) {
+    let nodes = elements.nodes(face.element);
+    let [a, b, c] = face.corners;
     match elements {
         Elements::Tet4(_) => triangles.push([nodes[a], nodes[b], nodes[c]]),
         Elements::Tet10(_) => {

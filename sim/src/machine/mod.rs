@@ -15,7 +15,7 @@ pub use error::{MachineError, MeshArgumentProblem, Place, Problem};
 pub use flexible::{FlexibleBody, REDUCTION_VERSION};
 
 use crate::fe::read_abaqus;
-use crate::reduction::{ReducedBody, ReductionError};
+use crate::reduction::{ReducedBody, ReductionError, cached};
 use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
@@ -191,11 +191,13 @@ impl Machine {
         with_payload: bool,
         cache_dir: Option<&Path>,
     ) -> Result<Vec<ReducedBody>, ReductionError> {
-        let _ = cache_dir;
-        self.flexible
-            .iter()
-            .map(|body| body.reduce(with_payload))
-            .collect()
+        let reduce = |body: &FlexibleBody| match cache_dir {
+            Some(folder) => cached(folder, body.reduction_key(with_payload), || {
+                body.reduce(with_payload)
+            }),
+            None => body.reduce(with_payload),
+        };
+        self.flexible.iter().map(reduce).collect()
     }
 }
 

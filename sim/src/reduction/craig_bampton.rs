@@ -226,7 +226,6 @@ fn project(
             node_count: model.mesh.node_count(),
             element_count: model.mesh.elements().len(),
             fixed_interface_hz: basis.fixed_interface_hz,
-            free_free_hz: Vec::new(),
             boundary_names: model
                 .boundary
                 .iter()

@@ -1,5 +1,6 @@
 //! From a finite-element model to a reduced body.
 
+mod cache;
 mod craig_bampton;
 mod damping;
 mod eigen;
@@ -7,6 +8,7 @@ mod factor;
 mod inertia_integrals;
 mod reduced_body;
 
+pub use cache::cached;
 pub use craig_bampton::{FlexibleModel, ModeBasis, clamped_hz, free_free_hz, mode_basis, reduce};
 pub use damping::Damping;
 pub use reduced_body::{ReducedBody, ReducedInterface, ReducedNode, ReductionReport};
