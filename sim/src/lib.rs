@@ -12,10 +12,11 @@ pub mod integrate;
 pub mod equilibrium;
 pub mod fast;
 pub mod trajectory;
+pub mod linearise;
 mod general;
 pub mod simulator;
 pub mod summary;
+pub mod scenario;
 
 #[cfg(test)]
 pub(crate) mod testing;
-pub mod scenario;

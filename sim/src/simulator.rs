@@ -11,6 +11,7 @@ use crate::equilibrium::{Equilibrium, equilibrium};
 use crate::fast::{self, NotPlanar, PlanarModel};
 use crate::general::GeneralRun;
 use crate::integrate::Scheme;
+use crate::linearise::{Actuation, Linearisation, linearise};
 use crate::machine::Machine;
 use crate::reduction::{ReducedBody, ReductionError};
 use crate::system::{System, SystemError};
@@ -151,6 +152,23 @@ impl Simulator {
             angles_rad,
             &mut system.new_workspace(),
         )?)
+    }
+
+    /// Small motions about the equilibrium at the given angles.
+    ///
+    /// # Errors
+    /// If there is no equilibrium, or no eigenvalues are found.
+    pub fn linearise(
+        &self,
+        payload_kg: f64,
+        angles_rad: &[f64],
+        actuation: &Actuation,
+    ) -> Result<Linearisation, RunFailure> {
+        let variant = self.variant(payload_kg > 0.0)?;
+        let system = variant.system.with_payload_mass(payload_kg);
+        let mut ws = system.new_workspace();
+        let start = equilibrium(&system, self.machine.file(), angles_rad, &mut ws)?;
+        Ok(linearise(&system, &start.state, actuation, &mut ws)?)
     }
 
     /// Which path the accurate integrator takes for runs without or with payload.

@@ -1,4 +1,6 @@
 //! Oil: chambers, valve and cylinder (theory note §7).
+#![doc = ""]
+#![doc = include_str!("../../theory/hydraulics.md")]
 
 pub mod valve;
 pub mod chamber;

@@ -1,4 +1,6 @@
 //! Time integration with fixed steps (theory note §10).
+#![doc = ""]
+#![doc = include_str!("../../theory/time_integration.md")]
 
 mod scheme;
 mod step;

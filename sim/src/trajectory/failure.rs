@@ -2,6 +2,7 @@
 
 use crate::equilibrium::EquilibriumError;
 use crate::integrate::StepError;
+use crate::linearise::LinearisationError;
 use crate::simulator::SimulatorError;
 
 /// Why a run has no samples.
@@ -35,6 +36,9 @@ pub enum RunFailure {
     /// The machine cannot run at all with this payload.
     #[error(transparent)]
     Machine(#[from] SimulatorError),
+    /// The machine cannot be linearised.
+    #[error(transparent)]
+    Linearisation(#[from] LinearisationError),
     /// The run table does not fit the machine.
     #[error(transparent)]
     Input(#[from] InputError),

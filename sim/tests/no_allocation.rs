@@ -1,0 +1,72 @@
+//! Steps allocate nothing: a run of twice the length allocates as often as a run of the length.
+
+#![allow(
+    unsafe_code,
+    reason = "a counting allocator has to implement the unsafe trait GlobalAlloc"
+)]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use hydroflex_openapi::job::Integrator;
+use hydroflex_sim::machine::Machine;
+use hydroflex_sim::simulator::Simulator;
+use hydroflex_sim::trajectory::{RunInput, RunSettings};
+
+thread_local! {
+    // Per thread: the test harness's own thread allocates when it likes.
+    static COUNT: Cell<u64> = const { Cell::new(0) };
+}
+
+struct Counting;
+
+// SAFETY: every call goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        // A thread that ends has no counter any more; nobody asks for its count.
+        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// A rigid arm with one cylinder: no mesh, the same step loop.
+const MACHINE: &str = include_str!("../src/testing_rig.toml");
+
+#[test]
+fn the_step_loop_does_not_allocate() {
+    let simulator = Simulator::new(Machine::from_toml(MACHINE, &[]).unwrap()).unwrap();
+    let input = |samples: usize| RunInput {
+        run_id: 0,
+        payload_kg: 50.0,
+        angles_rad: vec![0.2],
+        valves_ratio: vec![(0..samples).map(|k| (k as f64 * 1.3).sin()).collect()],
+    };
+    for integrator in [
+        Integrator::TrapezoidalIndex2 { step_s: 0.001 },
+        Integrator::GeneralizedAlpha { step_s: 0.001 },
+    ] {
+        let settings = RunSettings {
+            integrator,
+            sample_time_s: 0.005,
+        };
+        let allocations = |samples: usize| {
+            let input = input(samples);
+            let before = COUNT.with(Cell::get);
+            simulator.run(&input, &settings).unwrap();
+            COUNT.with(Cell::get) - before
+        };
+        allocations(10);
+        let (short, long) = (allocations(50), allocations(500));
+        assert!(short > 0, "the counter counts");
+        assert_eq!(short, long);
+    }
+}
