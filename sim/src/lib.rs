@@ -17,6 +17,7 @@ mod general;
 pub mod simulator;
 pub mod summary;
 pub mod scenario;
+pub mod instruction_set;
 
 #[cfg(test)]
 pub(crate) mod testing;

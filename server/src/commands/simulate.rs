@@ -1,6 +1,24 @@
 //! `hydroflex simulate`: given runs, no service.
 
+mod run_table;
+
+use anyhow::{Context, bail, ensure};
+use hydroflex_dataset::{
+    DirectorySink, PublishSpec, Published, Publisher, RunKind, RunLengths, RunOutcome, RunRecord, RunSamples,
+    RunStatistics,
+};
+use hydroflex_openapi::dataset::{CodeFacts, DatasetSource, MachineFacts};
+use hydroflex_openapi::job::{Integrator, SampleType, Split};
+use hydroflex_sim::machine::Machine;
+use hydroflex_sim::simulator::Simulator;
+use hydroflex_sim::trajectory::{RunInput, RunSettings};
+use indicatif::{ProgressBar, ProgressStyle};
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+use std::io::Write;
 use std::path::PathBuf;
+use std::sync::mpsc;
+use std::time::Instant;
 
 /// Arguments of `hydroflex simulate`.
 #[derive(Debug, clap::Args)]
@@ -48,10 +66,227 @@ pub enum IntegratorName {
     GeneralizedAlpha,
 }
 
+/// Step of the fixed-step schemes where none is given, s.
+const DEFAULT_STEP_S: f64 = 0.005;
+
+/// Runs simulated between two visits to the writer, per thread; also bounded by their samples.
+const CHUNK_RUNS_PER_THREAD: usize = 16;
+const CHUNK_SAMPLES: usize = 200_000;
+
 /// Runs the command.
 ///
 /// # Errors
-/// Every failure ends the command with its reason.
-pub fn run(_args: Args) -> anyhow::Result<()> {
-    anyhow::bail!("not wired yet")
+/// Every failure ends the command with its reason; runs that fail are data.
+pub fn run(args: Args) -> anyhow::Result<()> {
+    let started = Instant::now();
+    let settings = settings(&args)?;
+    let sink = DirectorySink::create(&args.out)
+        .with_context(|| format!("--out {} must be absent or empty", args.out.display()))?;
+    let machine = Machine::load(&args.machine, &args.mesh)?;
+    let runs = run_table::read(&args.runs, machine.file())?;
+    let simulator = Simulator::new(machine)?;
+    let spec = publish_spec(&args, &simulator, &settings, &runs)?;
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads.unwrap_or(0))
+        .build()
+        .context("threads")?;
+    for with_payload in [false, true] {
+        if runs.iter().any(|run| (run.payload_kg > 0.0) == with_payload) {
+            pool.install(|| simulator.prepare(with_payload))?;
+        }
+    }
+
+    let bar = progress_bar(runs.len());
+    let mut publisher = Publisher::new(spec, sink)?;
+    let (sender, receiver) = mpsc::sync_channel::<Vec<RunRecord>>(1);
+    std::thread::scope(|scope| {
+        // one chunk is simulated while the one before it is written
+        scope.spawn(|| {
+            for chunk in chunks(&runs, pool.current_num_threads()) {
+                let simulate = |run| simulate(&simulator, &settings, run, &bar);
+                let records = pool.install(|| chunk.par_iter().map(simulate).collect());
+                if sender.send(records).is_err() {
+                    break; // the writer has failed, and says why
+                }
+            }
+            drop(sender);
+        });
+        for records in receiver {
+            for record in &records {
+                publisher.push(record)?;
+            }
+        }
+        anyhow::Ok(())
+    })?;
+    let (published, sink) = publisher.finish()?;
+    sink.commit()
+        .with_context(|| format!("--out {}", args.out.display()))?;
+    bar.finish_and_clear();
+    report(&args, &published, started.elapsed().as_secs_f64())
+}
+
+fn settings(args: &Args) -> anyhow::Result<RunSettings> {
+    ensure!(
+        args.sample_s.is_finite() && args.sample_s > 0.0,
+        "--sample-s is {}, allowed is above 0",
+        args.sample_s
+    );
+    ensure!(args.threads != Some(0), "--threads is 0, allowed is 1 or more");
+    let step_s = args.step_s.unwrap_or(DEFAULT_STEP_S);
+    let integrator = match (args.integrator, args.step_s) {
+        (IntegratorName::Accurate, None) => Integrator::Accurate,
+        (IntegratorName::Accurate, Some(step_s)) => bail!(
+            "--step-s {step_s} does not go with --integrator accurate, which chooses its steps itself; \
+             it belongs to trapezoidal-index-2 and generalized-alpha"
+        ),
+        (IntegratorName::TrapezoidalIndex2, _) => Integrator::TrapezoidalIndex2 { step_s },
+        (IntegratorName::GeneralizedAlpha, _) => Integrator::GeneralizedAlpha { step_s },
+    };
+    if integrator != Integrator::Accurate {
+        let ratio = args.sample_s / step_s;
+        ensure!(
+            step_s > 0.0 && ratio.round() >= 1.0 && (ratio - ratio.round()).abs() < 1e-9 * ratio,
+            "--step-s is {step_s}, allowed is --sample-s ({}) divided by a whole number",
+            args.sample_s
+        );
+    }
+    Ok(RunSettings {
+        integrator,
+        sample_time_s: args.sample_s,
+    })
+}
+
+fn publish_spec(
+    args: &Args,
+    simulator: &Simulator,
+    settings: &RunSettings,
+    runs: &[RunInput],
+) -> anyhow::Result<PublishSpec> {
+    let table = std::fs::read(&args.runs)?;
+    let machine = simulator.machine();
+    let rows = |run: &RunInput| run.valves_ratio.first().map_or(0, Vec::len) as u64 + 1;
+    Ok(PublishSpec {
+        source: DatasetSource::RunTable {
+            sha256: hex::encode(Sha256::digest(&table)),
+            integrator: settings.integrator,
+        },
+        machine: MachineFacts {
+            name: machine.file().name.clone(),
+            toml: machine.text().to_owned(),
+            content_sha256: hex::encode(machine.content_hash()),
+            angles: machine.file().angles.iter().map(|a| a.name.clone()).collect(),
+        },
+        code: CodeFacts {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            instruction_set: hydroflex_sim::instruction_set::level().to_owned(),
+        },
+        channels: simulator.channels().to_vec(),
+        sample_time_s: settings.sample_time_s,
+        sample_type: if args.float32 {
+            SampleType::Float32
+        } else {
+            SampleType::Float64
+        },
+        split: Split::default(),
+        lengths: RunLengths::Listed(runs.iter().map(rows).collect()),
+    })
+}
+
+/// Parts of the table that fit into memory whatever the length of its runs.
+fn chunks(runs: &[RunInput], threads: usize) -> Vec<&[RunInput]> {
+    let samples = |run: &RunInput| run.valves_ratio.first().map_or(0, Vec::len) + 1;
+    let mut chunks = Vec::new();
+    let mut rest = runs;
+    while !rest.is_empty() {
+        let mut sum = 0;
+        let fitting = rest
+            .iter()
+            .take(CHUNK_RUNS_PER_THREAD * threads)
+            .take_while(|run| {
+                sum += samples(run);
+                sum <= CHUNK_SAMPLES * threads
+            });
+        let (chunk, later) = rest.split_at(fitting.count().max(1));
+        chunks.push(chunk);
+        rest = later;
+    }
+    chunks
+}
+
+fn simulate(simulator: &Simulator, settings: &RunSettings, run: &RunInput, bar: &ProgressBar) -> RunRecord {
+    let (outcome, flags, statistics) = match simulator.run(run, settings) {
+        Ok(trajectory) => {
+            let statistics = RunStatistics {
+                steps: trajectory.statistics.steps,
+                rejected: trajectory.statistics.rejected,
+                iterations: trajectory.statistics.iterations,
+                factorisations: trajectory.statistics.factorisations,
+            };
+            let samples = RunSamples {
+                sample_count: trajectory.sample_count,
+                columns: trajectory.columns,
+            };
+            (RunOutcome::Ok(samples), trajectory.flags, statistics)
+        }
+        Err(failure) => {
+            let reason = failure.to_string();
+            (
+                RunOutcome::Failed { reason },
+                Vec::new(),
+                RunStatistics::default(),
+            )
+        }
+    };
+    bar.inc(1);
+    RunRecord {
+        kind: RunKind::Job,
+        run_id: run.run_id,
+        seed: None,
+        payload_kg: run.payload_kg,
+        angles_rad: run.angles_rad.clone(),
+        outcome,
+        flags,
+        statistics,
+    }
+}
+
+/// On a terminal; elsewhere nothing is drawn.
+fn progress_bar(runs: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template("simulating {bar:40} {pos}/{len} runs, {eta} left");
+    let bar = ProgressBar::new(runs as u64);
+    match style {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar, // the template is constant; its default would do
+    }
+}
+
+fn report(args: &Args, published: &Published, wall_s: f64) -> anyhow::Result<()> {
+    let manifest = &published.manifest;
+    let bytes: u64 = published.files.iter().map(|file| file.bytes).sum();
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        let summary = serde_json::json!({
+            "out": args.out,
+            "dataset_sha256": published.dataset_sha256,
+            "machine": manifest.machine.name,
+            "machine_sha256": manifest.machine.content_sha256,
+            "runs": manifest.runs,
+            "flags": manifest.flags,
+            "files": published.files.len(),
+            "bytes": bytes,
+            "wall_s": wall_s,
+        });
+        writeln!(out, "{summary}")?;
+    } else {
+        writeln!(
+            out,
+            "{} runs ({} failed) in {wall_s:.1} s, {:.1} MB in {}",
+            manifest.runs.total,
+            manifest.runs.failed,
+            bytes as f64 / 1e6,
+            args.out.display()
+        )?;
+        writeln!(out, "sha256 {}", published.dataset_sha256)?;
+    }
+    Ok(())
 }
