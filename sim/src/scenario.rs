@@ -186,3 +186,6 @@ fn valve_signal(
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -141,45 +141,49 @@ fn field(file: &str, set: &str, column: &str, data_type: &str, description: &str
     ])
 }
 
-/// The standard's own context, term by term.
+/// The standard's own context for version 1.0, term by term; most terms are `cr:` and their name.
 fn context() -> Json {
+    const PLAIN: [(&str, &str); 25] = [
+        ("citeAs", "cr:citeAs"),
+        ("column", "cr:column"),
+        ("equivalentProperty", "cr:equivalentProperty"),
+        ("extract", "cr:extract"),
+        ("field", "cr:field"),
+        ("fileObject", "cr:fileObject"),
+        ("fileProperty", "cr:fileProperty"),
+        ("fileSet", "cr:fileSet"),
+        ("format", "cr:format"),
+        ("includes", "cr:includes"),
+        ("isLiveDataset", "cr:isLiveDataset"),
+        ("jsonPath", "cr:jsonPath"),
+        ("key", "cr:key"),
+        ("md5", "cr:md5"),
+        ("parentField", "cr:parentField"),
+        ("path", "cr:path"),
+        ("recordSet", "cr:recordSet"),
+        ("references", "cr:references"),
+        ("regex", "cr:regex"),
+        ("repeated", "cr:repeated"),
+        ("replace", "cr:replace"),
+        ("samplingRate", "cr:samplingRate"),
+        ("separator", "cr:separator"),
+        ("source", "cr:source"),
+        ("subField", "cr:subField"),
+    ];
     let typed = |id: &str, kind: &str| Json::Object(vec![("@id", text(id)), ("@type", text(kind))]);
-    Json::Object(vec![
+    let mut terms = vec![
         ("@language", text("en")),
         ("@vocab", text("https://schema.org/")),
-        ("citeAs", text("cr:citeAs")),
-        ("column", text("cr:column")),
-        ("conformsTo", text("dct:conformsTo")),
+        ("sc", text("https://schema.org/")),
         ("cr", text("http://mlcommons.org/croissant/")),
         ("rai", text("http://mlcommons.org/croissant/RAI/")),
+        ("dct", text("http://purl.org/dc/terms/")),
+        ("conformsTo", text("dct:conformsTo")),
+        ("transform", text("cr:transform")),
         ("data", typed("cr:data", "@json")),
         ("dataType", typed("cr:dataType", "@vocab")),
-        ("dct", text("http://purl.org/dc/terms/")),
         ("examples", typed("cr:examples", "@json")),
-        ("extract", text("cr:extract")),
-        ("field", text("cr:field")),
-        ("fileProperty", text("cr:fileProperty")),
-        ("fileObject", text("cr:fileObject")),
-        ("fileSet", text("cr:fileSet")),
-        ("format", text("cr:format")),
-        ("includes", text("cr:includes")),
-        ("isLiveDataset", text("cr:isLiveDataset")),
-        ("jsonPath", text("cr:jsonPath")),
-        ("key", text("cr:key")),
-        ("md5", text("cr:md5")),
-        ("parentField", text("cr:parentField")),
-        ("path", text("cr:path")),
-        ("recordSet", text("cr:recordSet")),
-        ("references", text("cr:references")),
-        ("regex", text("cr:regex")),
-        ("repeated", text("cr:repeated")),
-        ("replace", text("cr:replace")),
-        ("sc", text("https://schema.org/")),
-        ("separator", text("cr:separator")),
-        ("source", text("cr:source")),
-        ("subField", text("cr:subField")),
-        ("transform", text("cr:transform")),
-        ("isArray", text("cr:isArray")),
-        ("arrayShape", text("cr:arrayShape")),
-    ])
+    ];
+    terms.extend(PLAIN.map(|(term, id)| (term, text(id))));
+    Json::Object(terms)
 }

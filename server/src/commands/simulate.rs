@@ -61,6 +61,7 @@ pub enum IntegratorName {
     /// Error-controlled
     Accurate,
     /// Newmark 1/4, 1/2 with velocity-level constraints, as the published scripts
+    #[value(name = "trapezoidal-index-2")]
     TrapezoidalIndex2,
     /// Generalised-alpha, spectral radius 0.7, position-level constraints
     GeneralizedAlpha,
