@@ -95,7 +95,7 @@ impl CheckedMachine {
         };
         let code = CodeFacts {
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            instruction_set: "portable".to_owned(),
+            instruction_set: hydroflex_sim::instruction_set::level().to_owned(),
         };
         PublishSpec::of_job(spec, machine, code, self.0.simulator.channels().to_vec())
     }
