@@ -182,6 +182,13 @@ impl Simulator {
         })
     }
 
+    /// Whether [`Simulator::run_batch`] simulates runs side by side, rather than one after the other.
+    #[must_use]
+    pub fn runs_side_by_side(&self, settings: &RunSettings, with_payload: bool) -> bool {
+        settings.integrator == Integrator::Accurate
+            && matches!(self.accurate_path(with_payload), Ok(AccuratePath::Planar))
+    }
+
     /// Simulates many runs on the calling thread; results in the order of the inputs, each bit for
     /// bit what [`Simulator::run`] gives. Where the accurate integrator has minimal coordinates,
     /// runs of one payload share the vector registers and cost a quarter of what they cost alone.

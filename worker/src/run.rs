@@ -4,7 +4,7 @@ use crate::machines::ReadyMachine;
 use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
 use hydroflex_openapi::job::JobSpec;
 use hydroflex_sim::scenario::{self, ScenarioError};
-use hydroflex_sim::trajectory::{RunInput, RunSettings};
+use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
 
 /// The run as planned, with the record that it will get if it leaves no samples.
 pub struct PlannedRun {
@@ -43,11 +43,13 @@ impl PlannedRun {
     /// goes through to whoever counts attempts.
     #[must_use]
     pub fn simulate(self, spec: &JobSpec, machine: &ReadyMachine) -> RunRecord {
-        let settings = RunSettings {
-            integrator: spec.integrator,
-            sample_time_s: spec.sample_time_s,
-        };
-        match machine.simulator.run(&self.input, &settings) {
+        let result = machine.simulator.run(&self.input, &settings(spec));
+        self.ended(result)
+    }
+
+    /// The record of a simulated run.
+    fn ended(self, result: Result<Trajectory, RunFailure>) -> RunRecord {
+        match result {
             Ok(trajectory) => {
                 let statistics = RunStatistics {
                     steps: trajectory.statistics.steps,
@@ -91,5 +93,31 @@ impl PlannedRun {
             flags,
             statistics,
         }
+    }
+}
+
+/// Whether all of these runs can share the processor's vector registers.
+#[must_use]
+pub fn side_by_side(runs: &[PlannedRun], spec: &JobSpec, machine: &ReadyMachine) -> bool {
+    let together = |with_payload| machine.simulator.runs_side_by_side(&settings(spec), with_payload);
+    runs.iter().all(|run| together(run.input.payload_kg > 0.0))
+}
+
+/// Simulates several runs at a time, which costs a third of simulating them one by one and gives the
+/// same numbers. Panics as [`PlannedRun::simulate`] does.
+#[must_use]
+pub fn simulate_together(runs: Vec<PlannedRun>, spec: &JobSpec, machine: &ReadyMachine) -> Vec<RunRecord> {
+    let inputs: Vec<RunInput> = runs.iter().map(|run| run.input.clone()).collect();
+    let results = machine.simulator.run_batch(&inputs, &settings(spec));
+    runs.into_iter()
+        .zip(results)
+        .map(|(run, result)| run.ended(result))
+        .collect()
+}
+
+fn settings(spec: &JobSpec) -> RunSettings {
+    RunSettings {
+        integrator: spec.integrator,
+        sample_time_s: spec.sample_time_s,
     }
 }

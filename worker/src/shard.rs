@@ -110,15 +110,15 @@ pub fn make(
         let start = Instant::now();
         let records = pool.install(|| {
             batch
-                .par_iter()
-                .map(|index| simulate(spec, machine, kind, *index, control))
-                .collect::<Result<Vec<RunRecord>, ShardFailure>>()
+                .par_chunks(BATCH_PER_THREAD)
+                .map(|some| simulate(spec, machine, kind, some, control))
+                .collect::<Result<Vec<Vec<RunRecord>>, ShardFailure>>()
         })?;
         // Of one thread: what the shard would have cost alone.
         spent.simulate_s +=
             start.elapsed().as_secs_f64() * pool.current_num_threads().min(batch.len()) as f64;
         let start = Instant::now();
-        for record in &records {
+        for record in records.iter().flatten() {
             failed_runs += u64::from(record.status() == RunStatus::Failed);
             writer.push(record)?;
         }
@@ -136,7 +136,51 @@ pub fn make(
     })
 }
 
+/// Simulates some runs on one thread: together, or one by one if that panics, to name the culprit.
 fn simulate(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    runs: &[u64],
+    control: &ShardControl,
+) -> Result<Vec<RunRecord>, ShardFailure> {
+    if control.stop.load(Ordering::Relaxed) {
+        return Err(ShardFailure::Stopped);
+    }
+    for index in runs {
+        crash_point_of("run", *index);
+    }
+    let planned = runs
+        .iter()
+        .map(|index| plan(spec, machine, kind, *index))
+        .collect::<Result<Vec<_>, ShardFailure>>()?;
+    if run::side_by_side(&planned, spec, machine) {
+        let together = catch_unwind(AssertUnwindSafe(|| {
+            run::simulate_together(planned, spec, machine)
+        }));
+        if let Ok(records) = together {
+            control.runs_done.fetch_add(runs.len() as u64, Ordering::Relaxed);
+            return Ok(records);
+        }
+    }
+    runs.iter()
+        .map(|index| simulate_alone(spec, machine, kind, *index, control))
+        .collect()
+}
+
+fn plan(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    index: u64,
+) -> Result<run::PlannedRun, ShardFailure> {
+    run::plan(spec, machine, kind, index).map_err(|source| ShardFailure::Plan {
+        run_id: index,
+        source,
+    })
+}
+
+fn simulate_alone(
     spec: &JobSpec,
     machine: &ReadyMachine,
     kind: RunKind,
@@ -146,11 +190,7 @@ fn simulate(
     if control.stop.load(Ordering::Relaxed) {
         return Err(ShardFailure::Stopped);
     }
-    crash_point_of("run", index);
-    let planned = run::plan(spec, machine, kind, index).map_err(|source| ShardFailure::Plan {
-        run_id: index,
-        source,
-    })?;
+    let planned = plan(spec, machine, kind, index)?;
     let record = catch_unwind(AssertUnwindSafe(|| planned.simulate(spec, machine)));
     control.runs_done.fetch_add(1, Ordering::Relaxed);
     record.map_err(|cause| {
