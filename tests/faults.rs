@@ -269,3 +269,82 @@ fn a_directory_in_use_is_refused() {
     assert!(second.contains("in use by another hydroflex"), "{second}");
     first.terminate().unwrap();
 }
+
+/// The job with a network whose training takes a few seconds and is a function of its seed.
+fn job_with_training() -> serde_json::Value {
+    let mut job = job(RUNS);
+    job["train"] = serde_json::json!([{
+        "structure": "RLR",
+        "window": { "rule": "given", "window_s": 0.1 },
+        "targets": ["deflection_tip_y_m"],
+        "epochs": 400,
+        "windows": "overlapping",
+    }]);
+    job
+}
+
+#[test]
+fn a_killed_trainer_goes_on_and_ends_with_the_same_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &workers(1)).unwrap();
+    let id = service.submit(&job_with_training()).unwrap().job_id.to_string();
+    let undisturbed = service.wait_for(&id, finished).unwrap();
+    assert_eq!(
+        undisturbed.state,
+        JobState::Succeeded,
+        "{undisturbed:?}\n{}",
+        service.log()
+    );
+    let epoch = |status: &JobStatus| {
+        status
+            .trainings
+            .first()
+            .and_then(|t| t.progress.as_ref())
+            .map_or(0, |progress| progress.epoch)
+    };
+    let id = service.submit(&job_with_training()).unwrap().job_id.to_string();
+    let status = service.wait_for(&id, |s| finished(s) || epoch(s) > 100).unwrap();
+    assert!(
+        !finished(&status),
+        "the training was over before it could be killed: {status:?}"
+    );
+    signal(service.wait_for_children("train", 1).unwrap()[0], Signal::SIGKILL).unwrap();
+    // And once more, with everything else.
+    let status = service.wait_for(&id, |s| finished(s) || epoch(s) > 250).unwrap();
+    assert!(!finished(&status), "{status:?}");
+    service.kill().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &workers(1)).unwrap();
+    let status = service.wait_for(&id, finished).unwrap();
+    assert_eq!(status.state, JobState::Succeeded, "{status:?}\n{}", service.log());
+    assert_eq!(status.model_ids, undisturbed.model_ids);
+    // The model answers, although this process has never loaded it.
+    let model = &status.model_ids[0];
+    let config = service
+        .get(&format!("/v1/models/{model}/files/config.json"))
+        .unwrap();
+    let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
+    let inputs: serde_json::Map<String, serde_json::Value> = config["inputs"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|input| {
+            (
+                input["name"].as_str().unwrap().to_owned(),
+                input["offset"].clone(),
+            )
+        })
+        .collect();
+    let answer = service
+        .post_json(
+            &format!("/v1/models/{model}/predict"),
+            &serde_json::json!({ "inputs": inputs }),
+        )
+        .unwrap();
+    assert_eq!(answer["count"], 1);
+    assert!(
+        answer["estimates"]["deflection_tip_y_m"][0]
+            .as_f64()
+            .unwrap()
+            .is_finite()
+    );
+}

@@ -105,7 +105,6 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         },
     );
     let state = AppState::new(coordinator.clone());
-    let _ = http::operations::recorder();
     let stop = CancellationToken::new();
     let supervisor = Supervisor::start(SuperviseConfig {
         executable: config.executable,

@@ -196,6 +196,17 @@ impl ServiceUnderTest {
         Ok(response.bytes()?.to_vec())
     }
 
+    /// Posts JSON to a path and reads JSON.
+    ///
+    /// # Errors
+    /// What the service says.
+    pub fn post_json(&self, path: &str, body: &serde_json::Value) -> anyhow::Result<serde_json::Value> {
+        let response = self.http.post(format!("{}{path}", self.url)).json(body).send()?;
+        let (status, text) = (response.status(), response.text()?);
+        ensure!(status.is_success(), "{status}: {text}");
+        Ok(serde_json::from_str(&text)?)
+    }
+
     /// Waits until a job is as wanted.
     ///
     /// # Errors

@@ -60,6 +60,14 @@ pub fn fetch(client: &Client, dataset: &str, out: &Path, quiet: bool) -> anyhow:
     let info: DatasetInfo = client.get(&format!("/v1/datasets/{dataset}"))?;
     let base = format!("/v1/datasets/{dataset}/files");
     fetch_files(client, &base, &info.files, out, quiet)?;
+    // The service's list and the data set's own must agree: the id promises the latter.
+    let found = sha256_of(&out.join("SHA256SUMS"))?;
+    if found != info.dataset_sha256 {
+        bail!(
+            "SHA256SUMS has SHA-256 {found}, the data set should have {}",
+            info.dataset_sha256
+        );
+    }
     Ok(info)
 }
 

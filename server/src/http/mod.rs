@@ -141,6 +141,8 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
 
 /// The whole service as one function.
 pub fn router(state: AppState) -> Router {
+    // From the first request on; it is there once per process however many routers are made.
+    let _ = operations::recorder();
     let (router, _) = routes().split_for_parts();
     router
         .merge(file_routes())

@@ -1,0 +1,384 @@
+//! The REST interface, asked right and asked wrong.
+
+mod common;
+
+use axum::body::Body;
+use common::Desk;
+use hydroflex_ledger::{NewDataset, NewJob, ShardResult};
+use hydroflex_openapi::catalogue::{DatasetInfo, DatasetPage, FileEntry, MachineList};
+use hydroflex_openapi::id::DatasetId;
+use hydroflex_openapi::status::{JobPage, JobState, JobStatus, TimeSplit};
+use sha2::{Digest, Sha256};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_is_accepted_shown_listed_and_cancelled() {
+    let desk = Desk::new().await;
+    let accepted = desk.post("/v1/jobs", r#"{"runs": 80}"#).await;
+    assert_eq!(
+        accepted.status,
+        202,
+        "{}",
+        String::from_utf8_lossy(&accepted.body)
+    );
+    let job: JobStatus = accepted.json();
+    assert_eq!(accepted.header("location"), format!("/v1/jobs/{}", job.job_id));
+    assert!(!accepted.header("retry-after").is_empty());
+    assert_eq!((job.state, job.progress.runs_total), (JobState::Queued, 80));
+    let shown: JobStatus = desk.get(accepted.header("location")).await.json();
+    assert_eq!(shown, job);
+    let listed: JobPage = desk.get("/v1/jobs").await.json();
+    assert_eq!(listed.jobs, [job.clone()]);
+    let cancelled: JobStatus = desk
+        .post(&format!("/v1/jobs/{}/cancel", job.job_id), "")
+        .await
+        .json();
+    assert_eq!(cancelled.state, JobState::Cancelled);
+    let again = desk.post(&format!("/v1/jobs/{}/cancel", job.job_id), "").await;
+    assert_eq!(again.status, 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_repeated_request_with_a_key_makes_one_job() {
+    let desk = Desk::new().await;
+    let key = [
+        ("content-type", "application/json"),
+        ("idempotency-key", "friday-17"),
+    ];
+    let first = desk.send("POST", "/v1/jobs", &key, r#"{"runs": 80}"#).await;
+    let second = desk.send("POST", "/v1/jobs", &key, r#"{"runs": 80}"#).await;
+    assert_eq!(first.header("location"), second.header("location"));
+    let other = desk.send("POST", "/v1/jobs", &key, r#"{"runs": 81}"#).await;
+    assert_eq!(other.problem(422).kind, "/problems/idempotency-key-reused");
+    let listed: JobPage = desk.get("/v1/jobs").await.json();
+    assert_eq!(listed.jobs.len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_refusal_names_field_value_and_what_is_allowed() {
+    let desk = Desk::new().await;
+    for (body, pointer) in [
+        (r#"{"runs": 0}"#, "/runs"),
+        (r#"{"runs": 80, "duration_s": -1.0}"#, "/duration_s"),
+        (r#"{"runs": 80, "machine": "forklift"}"#, "/machine"),
+        (r#"{"runs": 80, "machine": "/etc/passwd"}"#, "/machine"),
+        (r#"{"runs": 80, "machine": "lift-boom-published"}"#, "/machine"),
+        (
+            r#"{"runs": 80, "machine": {"toml": "format = 1"}}"#,
+            "/machine/toml",
+        ),
+        (r#"{"runs": 80, "wheels": 4}"#, "/wheels"),
+        (r#"{"runs": "many"}"#, "/runs"),
+        (r#"{"runs": 80, "payload_kg": -5.0}"#, "/payload_kg"),
+        (
+            r#"{"runs": 80, "train": [{"structure": "QQQ"}]}"#,
+            "/train/0/structure",
+        ),
+        (
+            r#"{"runs": 80, "train": [{"targets": ["wind_m_per_s"]}]}"#,
+            "/train/0/targets/0",
+        ),
+    ] {
+        let problem = desk.post("/v1/jobs", body).await.problem(422);
+        let pointers: Vec<&str> = problem
+            .errors
+            .iter()
+            .map(|error| error.pointer.as_str())
+            .collect();
+        assert!(pointers.contains(&pointer), "{body}: {problem:?}");
+    }
+    let listed: JobPage = desk.get("/v1/jobs").await.json();
+    assert!(listed.jobs.is_empty(), "a refused job leaves nothing");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whatever_goes_wrong_is_a_problem() {
+    let desk = Desk::new().await;
+    desk.get("/nothing/here").await.problem(404);
+    desk.get("/v1/jobs/17").await.problem(404);
+    desk.get("/v1/jobs/01a20431-1cf0-7719-af78-6b255de1ee1f")
+        .await
+        .problem(404);
+    desk.get("/v1/jobs/01a20431-1cf0-7719-af78-6b255de1ee1f/events")
+        .await
+        .problem(404);
+    desk.get("/v1/datasets/9f86d081884c7d659a2feaa0c55ad015")
+        .await
+        .problem(404);
+    desk.get("/v1/models/%2e%2e%2f%2e%2e").await.problem(404);
+    desk.get("/v1/jobs/%ff").await.problem(404);
+    desk.get("/v1/machines/forklift").await.problem(404);
+    desk.get("/v1/jobs?limit=0").await.problem(422);
+    desk.get("/v1/jobs?limit=x").await.problem(422);
+    desk.get("/v1/jobs?cursor=x").await.problem(422);
+    desk.get("/v1/datasets?cursor=x").await.problem(422);
+    desk.send("DELETE", "/v1/jobs", &[], Body::empty())
+        .await
+        .problem(405);
+    desk.send("PUT", "/v1/datasets/x/files/y", &[], Body::empty())
+        .await
+        .problem(405);
+    desk.post("/v1/jobs", "{").await.problem(400);
+    desk.post("/v1/jobs", &"[".repeat(10_000)).await.problem(400);
+    desk.send("POST", "/v1/jobs", &[], "{}").await.problem(415);
+    let key = [("content-type", "application/json"), ("idempotency-key", "")];
+    desk.send("POST", "/v1/jobs", &key, r#"{"runs": 80}"#)
+        .await
+        .problem(422);
+    let large = format!("{{\"title\": \"{}\"}}", "x".repeat(33 << 20));
+    desk.post("/v1/jobs", &large).await.problem(413);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn pages_follow_each_other_to_the_end() {
+    let desk = Desk::new().await;
+    let mut made = Vec::new();
+    for seed in 0..5 {
+        let job: JobStatus = desk
+            .post("/v1/jobs", &format!("{{\"runs\": 1, \"seed\": {seed}}}"))
+            .await
+            .json();
+        made.push(job.job_id);
+    }
+    made.reverse();
+    let (mut seen, mut path) = (Vec::new(), "/v1/jobs?limit=2".to_owned());
+    loop {
+        let page: JobPage = desk.get(&path).await.json();
+        seen.extend(page.jobs.iter().map(|job| job.job_id));
+        match page.next_cursor {
+            Some(cursor) => path = format!("/v1/jobs?limit=2&cursor={cursor}"),
+            None => break,
+        }
+    }
+    assert_eq!(seen, made);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn events_are_replayed_from_anywhere_and_end_with_the_job() {
+    let desk = Desk::new().await;
+    let job: JobStatus = desk.post("/v1/jobs", r#"{"runs": 1}"#).await.json();
+    desk.ledger.cancel_job(job.job_id).await.unwrap();
+    let path = format!("/v1/jobs/{}/events", job.job_id);
+    let all = desk.get(&path).await;
+    assert!(all.header("content-type").starts_with("text/event-stream"));
+    let text = String::from_utf8(all.body).unwrap();
+    assert!(text.contains("id: 1\n") && text.contains("id: 2\n"), "{text}");
+    assert!(text.contains("\"state\":\"cancelled\""), "{text}");
+    let rest = desk
+        .send("GET", &path, &[("last-event-id", "1")], Body::empty())
+        .await;
+    let text = String::from_utf8(rest.body).unwrap();
+    assert!(!text.contains("id: 1\n") && text.contains("id: 2\n"), "{text}");
+    let nothing = desk
+        .send("GET", &path, &[("last-event-id", "2")], Body::empty())
+        .await;
+    assert_eq!(nothing.status, 204);
+    desk.send("GET", &path, &[("last-event-id", "yesterday")], Body::empty())
+        .await
+        .problem(422);
+}
+
+/// A published data set of two files, without simulating it.
+async fn publish(desk: &Desk) -> (DatasetInfo, Vec<Vec<u8>>) {
+    let contents = vec![
+        (0..10_000_u32).flat_map(u32::to_le_bytes).collect(),
+        b"two\n".to_vec(),
+    ];
+    let hash = |content: &[u8]| hex::encode(Sha256::digest(content));
+    let files: Vec<FileEntry> = ["data/train-00000-of-00001.parquet", "README.md"]
+        .iter()
+        .zip(&contents)
+        .map(|(path, content): (_, &Vec<u8>)| FileEntry {
+            path: (*path).to_owned(),
+            size_bytes: content.len() as u64,
+            sha256: hash(content),
+        })
+        .collect();
+    let sha256 = hash(b"sums");
+    let id = DatasetId::of_sha256(&sha256).unwrap();
+    for (file, content) in files.iter().zip(&contents) {
+        desk.blobs
+            .create(&format!("datasets/{id}/{}", file.path), content.clone().into())
+            .await
+            .unwrap();
+    }
+    let spec: hydroflex_openapi::job::JobSpec =
+        serde_json::from_value(serde_json::json!({"runs": 1, "settling_runs": 0})).unwrap();
+    let new = NewJob {
+        spec: spec.clone(),
+        machine_sha256: hash(b""),
+        settling_shards: Vec::new(),
+        run_shards: vec![1],
+    };
+    let job = desk.ledger.create_job(&new, None).await.unwrap().id();
+    desk.ledger.register_worker("worker.test").await.unwrap();
+    let claim = desk.ledger.begin_shard("worker.test").await.unwrap().unwrap();
+    let result = ShardResult {
+        object: claim.object(),
+        sha256: hash(b""),
+        size_bytes: 0,
+        failed_runs: 0,
+        spent: TimeSplit::default(),
+    };
+    desk.ledger.commit_shard(&claim, &result).await.unwrap();
+    assert!(desk.ledger.begin_publishing(job).await.unwrap());
+    let dataset = NewDataset {
+        id: id.clone(),
+        sha256,
+        spec,
+        runs: 1,
+        files,
+    };
+    assert!(desk.ledger.publish_dataset(job, &dataset, &[]).await.unwrap());
+    (desk.get(&format!("/v1/datasets/{id}")).await.json(), contents)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn files_come_whole_in_ranges_or_not_again() {
+    let desk = Desk::new().await;
+    let (dataset, contents) = publish(&desk).await;
+    let listed: DatasetPage = desk.get("/v1/datasets").await.json();
+    assert_eq!(listed.datasets, [dataset.clone()]);
+    let file = &dataset.files[0];
+    let path = format!("/v1/datasets/{}/files/{}", dataset.dataset_id, file.path);
+    let etag = format!("\"{}\"", file.sha256);
+
+    let whole = desk.get(&path).await;
+    assert_eq!((whole.status.as_u16(), &whole.body), (200, &contents[0]));
+    assert_eq!(whole.header("etag"), etag);
+    assert_eq!(whole.header("accept-ranges"), "bytes");
+
+    let head = desk.send("HEAD", &path, &[], Body::empty()).await;
+    assert_eq!((head.status.as_u16(), head.body.len()), (200, 0));
+    assert_eq!(head.header("content-length"), "40000");
+
+    let part = desk
+        .send("GET", &path, &[("range", "bytes=100-199")], Body::empty())
+        .await;
+    assert_eq!(
+        (part.status.as_u16(), part.body.as_slice()),
+        (206, &contents[0][100..200])
+    );
+    assert_eq!(part.header("content-range"), "bytes 100-199/40000");
+    let tail = desk
+        .send("GET", &path, &[("range", "bytes=-8")], Body::empty())
+        .await;
+    assert_eq!(tail.body, contents[0][39_992..]);
+    let fresh = [("range", "bytes=0-0"), ("if-range", etag.as_str())];
+    assert_eq!(desk.send("GET", &path, &fresh, Body::empty()).await.status, 206);
+    let stale = [("range", "bytes=0-0"), ("if-range", "\"other\"")];
+    assert_eq!(desk.send("GET", &path, &stale, Body::empty()).await.status, 200);
+    let outside = desk
+        .send("GET", &path, &[("range", "bytes=40000-")], Body::empty())
+        .await;
+    outside.problem(416);
+    assert_eq!(outside.header("content-range"), "bytes */40000");
+    let known = desk
+        .send("GET", &path, &[("if-none-match", etag.as_str())], Body::empty())
+        .await;
+    assert_eq!((known.status.as_u16(), known.body.len()), (304, 0));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_beside_the_listed_files_can_be_reached() {
+    let desk = Desk::new().await;
+    let (dataset, _) = publish(&desk).await;
+    let base = format!("/v1/datasets/{}/files", dataset.dataset_id);
+    for path in [
+        "../../../ledger.sqlite",
+        "%2e%2e/%2e%2e/ledger.sqlite",
+        "/etc/passwd",
+        "data",
+        "data/",
+        "",
+        "x",
+    ] {
+        let answer = desk.get(&format!("{base}/{path}")).await;
+        answer.problem(404);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_archive_is_a_tar_of_every_file() {
+    let desk = Desk::new().await;
+    let (dataset, contents) = publish(&desk).await;
+    let answer = desk
+        .get(&format!("/v1/datasets/{}/archive.tar", dataset.dataset_id))
+        .await;
+    assert_eq!(answer.header("content-length"), answer.body.len().to_string());
+    let mut archive = tar::Archive::new(answer.body.as_slice());
+    let mut found = Vec::new();
+    for entry in archive.entries().unwrap() {
+        let mut entry = entry.unwrap();
+        let path = entry.path().unwrap().display().to_string();
+        let mut content = Vec::new();
+        std::io::Read::read_to_end(&mut entry, &mut content).unwrap();
+        found.push((path, content));
+    }
+    let folder = format!("hydroflex-{}", dataset.dataset_id);
+    let expected: Vec<(String, Vec<u8>)> = dataset
+        .files
+        .iter()
+        .map(|file| format!("{folder}/{}", file.path))
+        .zip(contents)
+        .collect();
+    assert_eq!(found, expected);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn trainings_are_checked_against_their_data_set() {
+    let desk = Desk::new().await;
+    let unknown = r#"{"dataset_id": "9f86d081884c7d659a2feaa0c55ad015"}"#;
+    assert_eq!(
+        desk.post("/v1/trainings", unknown).await.problem(422).errors[0].pointer,
+        "/dataset_id"
+    );
+    let (dataset, _) = publish(&desk).await;
+    let id = &dataset.dataset_id;
+    let bad = format!(r#"{{"dataset_id": "{id}", "spec": {{"targets": ["wind"]}}}}"#);
+    let pointer = desk.post("/v1/trainings", &bad).await.problem(422).errors[0]
+        .pointer
+        .clone();
+    assert_eq!(pointer, "/spec/targets/0");
+    // Without settling runs the window has to be given.
+    let spec = r#"{"window": {"rule": "given", "window_s": 0.1}}"#;
+    let good = desk
+        .post(
+            "/v1/trainings",
+            &format!(r#"{{"dataset_id": "{id}", "spec": {spec}}}"#),
+        )
+        .await;
+    assert_eq!(good.status, 202);
+    assert_eq!(desk.get(good.header("location")).await.status, 200);
+    let nobody = desk
+        .post(
+            "/v1/models/9f86d081884c7d659a2feaa0c55ad015/predict",
+            r#"{"inputs": {}}"#,
+        )
+        .await;
+    nobody.problem(404);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn machines_health_metrics_and_the_browsable_page_answer() {
+    let desk = Desk::new().await;
+    let machines: MachineList = desk.get("/v1/machines").await.json();
+    assert!(
+        machines
+            .machines
+            .iter()
+            .any(|machine| machine.name == "lift-boom" && machine.available)
+    );
+    assert_eq!(desk.get("/v1/machines/lift-boom").await.status, 200);
+    assert_eq!(desk.get("/health/live").await.body, b"live\n");
+    assert_eq!(desk.get("/health/ready").await.body, b"ready\n");
+    let metrics = String::from_utf8(desk.get("/metrics").await.body).unwrap();
+    assert!(metrics.contains("hydroflex_http_requests_total"), "{metrics}");
+    let page = String::from_utf8(desk.get("/docs/").await.body).unwrap();
+    assert!(page.contains("swagger"), "{page}");
+    assert!(
+        !page.contains("//unpkg") && !page.contains("//cdn"),
+        "the page works without the internet"
+    );
+    let document: serde_json::Value = desk.get("/openapi.json").await.json();
+    assert!(document["paths"]["/v1/jobs"].is_object());
+}
