@@ -3,6 +3,7 @@
 //!
 //! `HYDROFLEX_REFERENCE` names the folder with `liftboom/checks.json` and `liftboom/Job-1.inp`;
 //! without it these tests pass and say so.
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use hydroflex_sim::fe::{
     InterfaceNodes, MassKind, Material, Mesh, Surface, area_weights, assemble_mass, assemble_stiffness,
@@ -307,5 +308,63 @@ fn the_published_machine_file_gives_the_reference_bodies() {
         // sensors: tip deflection, tip strain, root stress
         body.sensor_nodes.remove(0);
         check_reduced(&r, &body, key);
+    }
+}
+
+#[test]
+fn the_published_crane_gives_the_reference_bodies() {
+    let Some(folder) = std::env::var_os("HYDROFLEX_REFERENCE") else {
+        eprintln!("HYDROFLEX_REFERENCE is not set: comparison with the reference skipped");
+        return;
+    };
+    let folder = PathBuf::from(folder).join("patu");
+    let mesh = |body: &str, file: &str| format!("{body}={}", folder.join(file).display());
+    let meshes = [
+        mesh("lift", "LiftBoom-Job-1.inp"),
+        mesh("tilt", "TiltBoom-Job-1.inp"),
+    ];
+    let machine = Machine::load("crane-published", &meshes).unwrap();
+    let checks: Value =
+        serde_json::from_str(&std::fs::read_to_string(folder.join("checks.json")).unwrap()).unwrap();
+    let bodies = machine.reduce(true, None).unwrap();
+    for (body, full) in bodies.iter().zip(machine.flexible_bodies()) {
+        let facts = &checks[&body.name];
+        let value = |key: &str| facts[key].as_f64().unwrap();
+        assert_eq!(body.mode_count() as u64, facts["n_modes"]);
+        assert_close(body.mass_kg, value("mass"), 1e-12, "mass");
+        let inertia = Matrix3::from_row_slice(&numbers(&facts["inertia_about_origin"]));
+        assert!((body.inertia_origin_kg_m2 - inertia).amax() < 1e-12 * inertia.amax());
+        let names = ["pivot", "piston", "cyl2", "link", "tilt", "ext"];
+        for (interface, reduced) in full.interfaces.iter().zip(&body.interfaces) {
+            let name = match interface.name.as_str() {
+                "tilt_base" => "cyl2",
+                "extension" => "ext",
+                name => name,
+            };
+            assert!(names.contains(&name));
+            let wanted = &facts["interfaces"][name];
+            assert_eq!(interface.nodes, indices(&wanted["nodes_zero_based"]));
+            let mean = Vector3::from_vec(numbers(&wanted["weighted_mean"]));
+            assert!((reduced.position_m - mean).norm() < 1e-14);
+        }
+        let frequencies = body.report.fixed_interface_hz.iter();
+        for (found, wanted) in frequencies.zip(numbers(&facts["eigenmode_Hz"])) {
+            // the reference's highest modes are 1e-9 above ours, and Rayleigh quotients err upwards
+            assert_close(*found, wanted, 1e-8, "fixed-interface frequency");
+        }
+        let l = body.mass_modal.clone().cholesky().unwrap().l();
+        let half = l.solve_lower_triangular(&body.stiffness_modal).unwrap();
+        let c = l.solve_lower_triangular(&half.transpose()).unwrap();
+        let mut found: Vec<f64> = c
+            .symmetric_eigenvalues()
+            .iter()
+            .map(|w2| w2.sqrt() / (2.0 * std::f64::consts::PI))
+            .collect();
+        found.sort_by(f64::total_cmp);
+        for (found, wanted) in found.iter().zip(numbers(&facts["reduced_system_Hz"])) {
+            assert_close(*found, wanted, 1e-8, "reduced frequency");
+        }
+        let sensor = facts["sensors"]["stress_mesh"].as_u64().unwrap();
+        assert!(body.sensor_nodes.iter().any(|node| node.node as u64 == sensor));
     }
 }

@@ -29,6 +29,7 @@ pub trait Tetrahedron<const N: usize> {
     fn mass_points() -> &'static [QuadraturePoint];
 
     /// Jacobian `J = ∂x/∂(L₂, L₃, L₄)` with `L₁ = 1 − L₂ − L₃ − L₄`; columns are tangents.
+    #[must_use]
     fn jacobian(x: &[Vector3<f64>; N], l: [f64; 4]) -> Matrix3<f64> {
         let derivatives = Self::shape_derivatives(l);
         let mut j = Matrix3::zeros();
@@ -45,6 +46,7 @@ pub trait Tetrahedron<const N: usize> {
 
     /// Shape-function gradients in space, 1/m, and `det J` (six times the volume for straight
     /// edges), m³. `None` where the Jacobian is singular.
+    #[must_use]
     fn gradients(x: &[Vector3<f64>; N], l: [f64; 4]) -> Option<([Vector3<f64>; N], f64)> {
         let j = Self::jacobian(x, l);
         let det = j.determinant();
@@ -59,6 +61,7 @@ pub trait Tetrahedron<const N: usize> {
     }
 
     /// Smallest `det J` over the integration points and the nodes, m³: positive for a valid element.
+    #[must_use]
     fn smallest_determinant(x: &[Vector3<f64>; N]) -> f64 {
         let at = |l: [f64; 4]| Self::jacobian(x, l).determinant();
         let points = Self::stiffness_points().iter().chain(Self::mass_points());
@@ -69,6 +72,7 @@ pub trait Tetrahedron<const N: usize> {
     }
 
     /// Volume, m³.
+    #[must_use]
     fn volume(x: &[Vector3<f64>; N]) -> f64 {
         Self::mass_points()
             .iter()
@@ -83,6 +87,7 @@ pub trait Tetrahedron<const N: usize> {
     /// ```
     ///
     /// `g_a` is the gradient of shape function a; λ, μ are Lamé's parameters.
+    #[must_use]
     fn stiffness(x: &[Vector3<f64>; N], material: &Material) -> [[Matrix3<f64>; N]; N] {
         let (lambda, mu) = (material.lame_lambda_pa(), material.shear_modulus_pa());
         let mut k = [[Matrix3::zeros(); N]; N];
@@ -105,6 +110,7 @@ pub trait Tetrahedron<const N: usize> {
     }
 
     /// Consistent mass per pair of nodes, kg; the same for the three directions.
+    #[must_use]
     fn consistent_mass(x: &[Vector3<f64>; N], material: &Material) -> SMatrix<f64, N, N> {
         let mut m = SMatrix::zeros();
         for (l, weight) in Self::mass_points() {
@@ -266,12 +272,12 @@ mod tests {
         let k = E::stiffness(x, &STEEL);
         let scale = k[0][0].norm();
         let w = Vector3::new(0.3, -0.5, 0.2);
-        for a in 0..N {
-            let shift: Matrix3<f64> = (0..N).map(|b| k[a][b]).sum();
-            let turn: Vector3<f64> = (0..N).map(|b| k[a][b] * w.cross(&x[b])).sum();
+        for (a, row) in k.iter().enumerate() {
+            let shift: Matrix3<f64> = row.iter().sum();
+            let turn: Vector3<f64> = row.iter().zip(x).map(|(k, x)| k * w.cross(x)).sum();
             assert!(shift.norm() < 1e-13 * scale && turn.norm() < 1e-13 * scale);
-            for b in 0..N {
-                assert!((k[a][b] - k[b][a].transpose()).norm() < 1e-14 * scale);
+            for (b, k_ab) in row.iter().enumerate() {
+                assert!((k_ab - k[b][a].transpose()).norm() < 1e-14 * scale);
             }
         }
         let mass = STEEL.density_kg_per_m3 * E::volume(x);

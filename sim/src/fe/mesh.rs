@@ -227,7 +227,8 @@ impl Mesh {
         faces
     }
 
-    /// Checks what a stiffness matrix needs: valid elements, no loose node, one rigid piece.
+    /// Checks every element and node by itself: valid elements, no loose node, at most two elements
+    /// on a face.
     ///
     /// # Errors
     /// The first defect found.
@@ -244,7 +245,15 @@ impl Mesh {
                 count: (node..self.node_count()).filter(loose).count(),
             });
         }
-        self.check_connected()
+        for same in self.sorted_faces().chunk_by(|a, b| a.nodes == b.nodes) {
+            if same.len() > 2 {
+                return Err(MeshDefect::CrowdedFace {
+                    count: same.len(),
+                    element: self.element_labels[same[0].element],
+                });
+            }
+        }
+        Ok(())
     }
 
     fn check_determinants<const N: usize, E: Tetrahedron<N>>(
@@ -264,28 +273,27 @@ impl Mesh {
         Ok(())
     }
 
-    /// Elements that share a face are one part, and so are parts that share three nodes off a line:
-    /// what is left over after that can move without strain.
-    fn check_connected(&self) -> Result<(), MeshDefect> {
-        let mut parts = Parts::singles(self.elements.len());
+    /// Checks that the mesh is one rigid piece, together with sets of nodes that move rigidly.
+    ///
+    /// Elements that share a face are one part, and so are parts, or a part and a rigid set, that
+    /// share three nodes off a line: what is left over after that can move without strain.
+    ///
+    /// # Errors
+    /// [`MeshDefect::Disconnected`] or [`MeshDefect::Hinged`].
+    pub fn check_connected(&self, rigid_sets: &[&[u32]]) -> Result<(), MeshDefect> {
+        let mut parts = Parts::singles(self.elements.len() + rigid_sets.len());
         for same in self.sorted_faces().chunk_by(|a, b| a.nodes == b.nodes) {
-            if same.len() > 2 {
-                return Err(MeshDefect::CrowdedFace {
-                    count: same.len(),
-                    element: self.element_labels[same[0].element],
-                });
-            }
             for pair in same.windows(2) {
                 parts.join(pair[0].element, pair[1].element);
             }
         }
-        while self.join_rigidly(&mut parts) {}
-        let sizes = parts.sizes();
+        while self.join_rigidly(rigid_sets, &mut parts) {}
+        let sizes = parts.sizes(self.elements.len());
         let Some(&(part_elements, element)) = sizes.iter().min().filter(|_| sizes.len() > 1) else {
             return Ok(());
         };
         let element = self.element_labels[element];
-        let shares_nodes = !self.shared_nodes(&mut parts).is_empty();
+        let shares_nodes = !self.shared_nodes(&[], &mut parts).is_empty();
         let parts = sizes.len();
         Err(if shares_nodes {
             MeshDefect::Hinged {
@@ -302,12 +310,16 @@ impl Mesh {
         })
     }
 
-    /// Nodes shared by pairs of parts.
-    fn shared_nodes(&self, parts: &mut Parts) -> BTreeMap<(usize, usize), Vec<u32>> {
+    /// Nodes shared by pairs of parts; rigid sets count after the elements.
+    fn shared_nodes(&self, rigid_sets: &[&[u32]], parts: &mut Parts) -> BTreeMap<(usize, usize), Vec<u32>> {
         let mut touching: Vec<(u32, usize)> = Vec::new();
         for element in 0..self.elements.len() {
             let part = parts.of(element);
             touching.extend(self.elements.nodes(element).iter().map(|node| (*node, part)));
+        }
+        for (i, set) in rigid_sets.iter().enumerate() {
+            let part = parts.of(self.elements.len() + i);
+            touching.extend(set.iter().map(|node| (*node, part)));
         }
         touching.sort_unstable();
         touching.dedup();
@@ -323,9 +335,9 @@ impl Mesh {
     }
 
     /// Joins parts that share three nodes off a line; whether any were.
-    fn join_rigidly(&self, parts: &mut Parts) -> bool {
+    fn join_rigidly(&self, rigid_sets: &[&[u32]], parts: &mut Parts) -> bool {
         let mut joined = false;
-        for ((a, b), nodes) in self.shared_nodes(parts) {
+        for ((a, b), nodes) in self.shared_nodes(rigid_sets, parts) {
             if !self.on_a_line(&nodes) {
                 joined |= parts.join(a, b);
             }
@@ -351,7 +363,7 @@ impl Mesh {
     }
 }
 
-/// Disjoint sets of elements.
+/// Disjoint sets of elements, and of rigid sets after them.
 struct Parts {
     parent: Vec<usize>,
 }
@@ -378,10 +390,10 @@ impl Parts {
         a != b
     }
 
-    /// (elements, smallest element) of every part.
-    fn sizes(&mut self) -> Vec<(usize, usize)> {
+    /// (elements, smallest element) of every part with elements.
+    fn sizes(&mut self, elements: usize) -> Vec<(usize, usize)> {
         let mut sizes = BTreeMap::new();
-        for element in 0..self.parent.len() {
+        for element in 0..elements {
             *sizes.entry(self.of(element)).or_insert(0) += 1;
         }
         sizes.into_iter().map(|(part, size)| (size, part)).collect()

@@ -2,6 +2,7 @@
 //!
 //! `abaqus` reads a mesh, `element` integrates one tetrahedron, `assembly` adds them up, `surface`
 //! and `interface` find the nodes that act as points, `recovery` brings strain back to nodes.
+#![doc = include_str!("../../theory/finite_elements.md")]
 
 mod abaqus;
 mod assembly;

@@ -7,7 +7,7 @@ pub(super) struct BuiltInMachine {
 }
 
 /// The machines; the first is the default.
-pub(super) const MACHINES: [BuiltInMachine; 2] = [
+pub(super) const MACHINES: [BuiltInMachine; 3] = [
     BuiltInMachine {
         name: "lift-boom",
         text: include_str!("../../machines/lift-boom.toml"),
@@ -15,6 +15,10 @@ pub(super) const MACHINES: [BuiltInMachine; 2] = [
     BuiltInMachine {
         name: "lift-boom-published",
         text: include_str!("../../machines/lift-boom-published.toml"),
+    },
+    BuiltInMachine {
+        name: "crane-published",
+        text: include_str!("../../machines/crane-published.toml"),
     },
 ];
 

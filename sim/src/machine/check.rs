@@ -6,7 +6,7 @@ use hydroflex_openapi::machine::{
     AngleSpec, Attachment, BodySpec, Boundary, CylinderSpec, DampingSpec, FlexibleBodySpec, FrictionSpec,
     MACHINE_FORMAT, MachineFile, RigidBodySpec, Selection, SensorQuantity, SensorSpec,
 };
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector3};
 use std::collections::BTreeSet;
 
 /// Ranges outside of which a number is a mistake of units rather than a machine.
@@ -156,7 +156,8 @@ impl Checker<'_> {
                 self.point(&format!("{at}.axis_end_m"), axis_end_m)?;
                 self.range(&format!("{at}.radius_m"), *radius_m, plausible::LENGTH_M, "m")?;
                 self.range(&format!("{at}.tolerance_m"), *tolerance_m, (1e-9, *radius_m), "m")?;
-                if axis_start_m == axis_end_m {
+                let axis = Vector3::from(*axis_end_m) - Vector3::from(*axis_start_m);
+                if axis.norm() < plausible::LENGTH_M.0 {
                     return Err(self.text.refuse(format!("{at}.axis_end_m"), Problem::NoAxis));
                 }
             }

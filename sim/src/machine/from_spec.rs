@@ -4,7 +4,8 @@ use super::error::{MachineError, Problem};
 use super::flexible::FlexibleBody;
 use super::text::MachineText;
 use crate::fe::{
-    InterfaceNodes, MassKind, Material, Mesh, Surface, area_weights, nodes_on_cylinder, uniform_weights,
+    InterfaceNodes, MassKind, Material, Mesh, MeshError, Surface, area_weights, nodes_on_cylinder,
+    uniform_weights,
 };
 use crate::reduction::Damping;
 use hydroflex_openapi::machine::{
@@ -68,6 +69,7 @@ pub(super) fn flexible_body(
         );
     }
     check_overlap(text, spec, index, &interfaces)?;
+    check_connected(text, spec, index, &mesh, &interfaces)?;
 
     let mut sensor_nodes = Vec::new();
     for (i, sensor) in file.sensors.iter().enumerate() {
@@ -211,6 +213,30 @@ fn check_overlap(
         }
     }
     Ok(())
+}
+
+/// Boundary interfaces move rigidly and may hold parts of a mesh together, as the published tilt
+/// boom's pins do its side plates.
+fn check_connected(
+    text: &MachineText<'_>,
+    spec: &FlexibleBodySpec,
+    index: usize,
+    mesh: &Mesh,
+    interfaces: &[InterfaceNodes],
+) -> Result<(), MachineError> {
+    let rigid: Vec<&[u32]> = interfaces
+        .iter()
+        .zip(&spec.interfaces)
+        .filter(|(_, spec)| spec.boundary == Boundary::Always)
+        .map(|(interface, _)| interface.nodes.as_slice())
+        .collect();
+    mesh.check_connected(&rigid).map_err(|defect| {
+        let problem = Problem::Mesh {
+            mesh: spec.name.clone(),
+            error: MeshError::Defect(defect),
+        };
+        text.refuse(format!("body[{index}].mesh"), problem)
+    })
 }
 
 fn nearest_surface_node(mesh: &Mesh, surface: &Surface, sensor: &SensorSpec) -> Result<u32, Problem> {

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 
 const PUBLISHED: &str = include_str!("../../machines/lift-boom-published.toml");
 const BUILT_IN: &str = include_str!("../../machines/lift-boom.toml");
+const CRANE: &str = include_str!("../../machines/crane-published.toml");
 
 fn edited(text: &str, from: &str, to: &str) -> String {
     assert!(text.contains(from), "{from}");
@@ -38,8 +39,12 @@ fn check(from: &str, to: &str, wanted: &str) {
 }
 
 #[test]
-fn both_built_in_files_parse() {
-    for (text, name) in [(PUBLISHED, "lift-boom-published"), (BUILT_IN, "lift-boom")] {
+fn the_built_in_files_parse() {
+    for (text, name) in [
+        (BUILT_IN, "lift-boom"),
+        (PUBLISHED, "lift-boom-published"),
+        (CRANE, "crane-published"),
+    ] {
         let file = Machine::parse_file(text).unwrap();
         assert_eq!(file.name, name);
         assert_eq!(Machine::built_in_text(name), Some(text));
@@ -240,7 +245,7 @@ fn load_error(name: &str, meshes: &[&str]) -> String {
 fn missing_machines_and_meshes_are_named() {
     assert_eq!(
         load_error("lift-bom", &[]),
-        "no machine is called `lift-bom` and there is no such file; built in: lift-boom, lift-boom-published"
+        "no machine is called `lift-bom` and there is no such file; built in: lift-boom, lift-boom-published, crane-published"
     );
     assert!(load_error("none.toml", &[]).starts_with("cannot read none.toml"));
     assert!(
@@ -248,6 +253,10 @@ fn missing_machines_and_meshes_are_named() {
             .contains("body `boom` needs a mesh: the published boom mesh, Job-1.inp; give it with --mesh FILE or --mesh boom=FILE")
     );
     assert!(load_error("lift-boom-published", &["absent.inp"]).contains("cannot read the mesh absent.inp"));
+    assert_eq!(
+        load_error("crane-published", &["a.inp"]),
+        "--mesh a.inp: write BODY=FILE: 2 bodies take a mesh (lift, tilt)"
+    );
     assert_eq!(
         load_error("lift-boom", &["jib=a.inp"]),
         "--mesh a.inp: there is no flexible body `jib`; flexible bodies: boom"

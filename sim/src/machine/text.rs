@@ -233,10 +233,8 @@ fn unknown_key(message: &str) -> Option<(&str, Vec<&str>)> {
 
 fn line_of(text: &str, position: usize) -> usize {
     let end = position.min(text.len());
-    1 + text.as_bytes()[..end]
-        .iter()
-        .filter(|byte| **byte == b'\n')
-        .count()
+    let newline = |byte: &&u8| **byte == b'\n';
+    1 + text.as_bytes()[..end].iter().filter(newline).count()
 }
 
 fn quoted_words(message: &str) -> Vec<&str> {

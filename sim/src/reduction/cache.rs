@@ -214,7 +214,7 @@ impl<'a> Reader<'a> {
             c_vectors: self
                 .rows3(squared)?
                 .column_iter()
-                .map(|column| column.into_owned())
+                .map(nalgebra::Matrix::into_owned)
                 .collect(),
             interfaces: self.list(|input| {
                 Some(ReducedInterface {

@@ -181,7 +181,9 @@ fn make_largest_entry_positive(shape: &mut [f64]) {
         .copied()
         .fold(0.0_f64, |a, b| if b.abs() > a.abs() { b } else { a });
     if largest < 0.0 {
-        shape.iter_mut().for_each(|x| *x = -*x);
+        for x in shape {
+            *x = -*x;
+        }
     }
 }
 

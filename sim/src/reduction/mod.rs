@@ -1,4 +1,5 @@
 //! From a finite-element model to a reduced body.
+#![doc = include_str!("../../theory/craig_bampton.md")]
 
 mod cache;
 mod craig_bampton;

@@ -2,6 +2,7 @@
 
 use super::*;
 use proptest::prelude::*;
+use std::fmt::Write;
 
 const UNIT: &str = "*Heading\n a title, with a comma\n** comment\n*Part, name=A\n*Node, nset=all\n\
     10, 0., 0., 0.\n 20, 1.0d0, 0, 0\n30, 0, 1, 0\n40, 0, 0, 1\n50, 1., 1, 1e0,\n\
@@ -82,14 +83,19 @@ fn a_mesh_in_two_pieces_is_refused() {
     let mut text = "*NODE\n".to_owned();
     for part in 0..2 {
         for (i, x) in ["0, 0, 0", "1, 0, 0", "0, 1, 0", "0, 0, 1"].iter().enumerate() {
-            text += &format!("{}, {x}\n", 10 * part + i + 1);
+            writeln!(text, "{}, {x}", 10 * part + i + 1).unwrap();
         }
     }
     text += "*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4\n2, 11, 12, 13, 14\n";
+    let mesh = read_abaqus(&text).unwrap();
+    let defect = mesh.check_connected(&[]).unwrap_err();
     assert_eq!(
-        refusal(&text),
+        defect.to_string(),
         "the mesh falls into 2 parts that share no node; one of 1 elements holds element 1"
     );
+    // pins through both hold them, three nodes each; two nodes do not
+    assert_eq!(mesh.check_connected(&[&[0, 1, 2, 5, 6, 7]]), Ok(()));
+    assert_eq!(mesh.check_connected(&[&[0, 1, 2, 5, 6]]), Err(defect));
 }
 
 proptest! {
