@@ -161,4 +161,3 @@ fn meets_its_tolerance_against_the_converged_reference() {
         }
     }
 }
-

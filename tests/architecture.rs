@@ -10,7 +10,15 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("hydroflex-dataset", &["hydroflex-openapi"]),
     ("hydroflex-ml", &["hydroflex-openapi", "hydroflex-dataset"]),
     ("hydroflex-ledger", &["hydroflex-openapi"]),
-    ("hydroflex-worker", &["hydroflex-openapi", "hydroflex-sim", "hydroflex-ledger", "hydroflex-dataset"]),
+    (
+        "hydroflex-worker",
+        &[
+            "hydroflex-openapi",
+            "hydroflex-sim",
+            "hydroflex-ledger",
+            "hydroflex-dataset",
+        ],
+    ),
     (
         "hydroflex-server",
         &[
@@ -28,13 +36,26 @@ const ALLOWED: &[(&str, &[&str])] = &[
 fn crates_use_only_what_the_architecture_allows() {
     let manifest = concat!(env!("CARGO_MANIFEST_DIR"), "/../Cargo.toml");
     let output = Command::new(env!("CARGO"))
-        .args(["metadata", "--format-version=1", "--no-deps", "--offline", "--manifest-path", manifest])
+        .args([
+            "metadata",
+            "--format-version=1",
+            "--no-deps",
+            "--offline",
+            "--manifest-path",
+            manifest,
+        ])
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    let allowed: BTreeMap<&str, BTreeSet<&str>> =
-        ALLOWED.iter().map(|(name, uses)| (*name, uses.iter().copied().collect())).collect();
+    let allowed: BTreeMap<&str, BTreeSet<&str>> = ALLOWED
+        .iter()
+        .map(|(name, uses)| (*name, uses.iter().copied().collect()))
+        .collect();
     let mut seen = BTreeSet::new();
     for package in metadata["packages"].as_array().unwrap() {
         let name = package["name"].as_str().unwrap();
@@ -42,7 +63,9 @@ fn crates_use_only_what_the_architecture_allows() {
         if name == "hydroflex-tests" {
             continue;
         }
-        let may = allowed.get(name).unwrap_or_else(|| panic!("{name} is not in the table of doors"));
+        let may = allowed
+            .get(name)
+            .unwrap_or_else(|| panic!("{name} is not in the table of doors"));
         for dependency in package["dependencies"].as_array().unwrap() {
             let used = dependency["name"].as_str().unwrap();
             // Tests of a crate may look further than the crate itself.
@@ -52,7 +75,10 @@ fn crates_use_only_what_the_architecture_allows() {
         }
     }
     for (name, _) in ALLOWED {
-        assert!(seen.contains(*name), "{name} is in the table, not in the workspace");
+        assert!(
+            seen.contains(*name),
+            "{name} is in the table, not in the workspace"
+        );
     }
 }
 
@@ -65,7 +91,11 @@ fn only_the_named_files_of_the_simulator_read_the_contract() {
             let path = entry.unwrap().path();
             if path.extension().is_some_and(|extension| extension == "rs") {
                 let text = std::fs::read_to_string(&path).unwrap();
-                assert!(!text.contains("hydroflex_openapi"), "{} reads the contract", path.display());
+                assert!(
+                    !text.contains("hydroflex_openapi"),
+                    "{} reads the contract",
+                    path.display()
+                );
             }
         }
     }

@@ -31,6 +31,9 @@ const SEED: u64 = 2026;
 /// Seed of the evaluation, which shares no run with the job.
 const EVALUATION_SEED: u64 = 4052;
 
+/// Payload of every run, kg: with it the boom rings long enough to be looked at.
+const PAYLOAD_KG: f64 = 100.0;
+
 /// Length of the evaluation signal, s.
 const EVALUATION_S: f64 = 10.0;
 
@@ -198,7 +201,7 @@ fn chain_of(args: &Args, url: &str) -> anyhow::Result<()> {
     let unseen = Dataset::open(&evaluation_dir).context("cannot open the evaluation data set")?;
     let runs = evaluation_runs(&unseen, &model).context("cannot read the evaluation data set")?;
     let result = evaluate(&model, &runs, unseen.dataset_sha256()).context("cannot evaluate the model")?;
-    let title = "Built-in lift boom: structural estimates from hydraulic signals";
+    let title = "Built-in lift boom, 100 kg payload: structural estimates from hydraulic signals";
     let picture = args.data.join("evaluation.svg");
     write(
         &picture,
@@ -290,12 +293,16 @@ fn say(args: &Args, text: &str) -> anyhow::Result<()> {
 }
 
 fn training_job(runs: u64) -> serde_json::Value {
-    json!({"title": "demo", "machine": "lift-boom", "runs": runs, "seed": SEED, "train": [{"structure": "best"}]})
+    json!({
+        "title": "demo", "machine": "lift-boom", "runs": runs, "seed": SEED, "payload_kg": PAYLOAD_KG,
+        "train": [{"structure": "best"}],
+    })
 }
 
 fn evaluation_job() -> serde_json::Value {
     json!({
         "title": "demo: unseen signal", "machine": "lift-boom", "runs": 1, "seed": EVALUATION_SEED,
+        "payload_kg": PAYLOAD_KG,
         "duration_s": EVALUATION_S, "excitation": {"kind": "cycle"}, "settling_runs": 0,
         "initial_angle_deg": {"lift": [EVALUATION_ANGLE_DEG, EVALUATION_ANGLE_DEG]},
         "split": {"train": 0.0, "validation": 0.0, "test": 1.0},
