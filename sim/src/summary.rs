@@ -108,7 +108,8 @@ pub struct BasisSummary {
     pub fixed_interface_hz: Vec<f64>,
     /// Frequencies of the reduced body with its first interface clamped.
     pub reduced_hz: Vec<f64>,
-    /// The same of the full model, as many as the reduction is meant to keep: what it lost.
+    /// The same of the full model, as many as the reduction is meant to keep: what it lost. Empty
+    /// if the first interface alone does not hold the body.
     pub full_hz: Vec<f64>,
 }
 
@@ -187,7 +188,11 @@ fn flexible_summary(
     for node in &body.interfaces[0].nodes {
         is_fixed[*node as usize] = true;
     }
-    let full_hz = clamped_hz(&stiffness, &mass, &is_fixed, FULL_COUNT)?;
+    let full_hz = match clamped_hz(&stiffness, &mass, &is_fixed, FULL_COUNT) {
+        // parts that only their other interfaces hold, as the published tilt boom has
+        Err(ReductionError::SingularStiffness { .. }) => Vec::new(),
+        full_hz => full_hz?,
+    };
     let mut bases = vec![basis(without, false, &full_hz)];
     if body.boundary_with_payload != body.boundary_without_payload {
         bases.push(basis(&simulator.reduced(true)?[index], true, &full_hz));

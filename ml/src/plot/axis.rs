@@ -20,10 +20,14 @@ impl Axis {
         self.start_px + (value - self.min) / (self.max - self.min) * (self.end_px - self.start_px)
     }
 
-    /// Round values inside the axis, about `count` of them.
+    /// Round values inside the axis, about `count` of them, at least three.
     #[must_use]
     pub fn ticks(&self, count: usize) -> Vec<f64> {
-        let step = round_step((self.max - self.min) / count as f64);
+        let ticks = self.multiples(round_step((self.max - self.min) / count as f64));
+        if ticks.len() < 3 && count < 12 { self.ticks(count + 1) } else { ticks }
+    }
+
+    fn multiples(&self, step: f64) -> Vec<f64> {
         let first = (self.min / step - 1e-9).ceil();
         let last = (self.max / step + 1e-9).floor();
         #[allow(

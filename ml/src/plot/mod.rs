@@ -50,10 +50,10 @@ const LEFT: f64 = 92.0;
 const RIGHT: f64 = 24.0;
 const HEADER: f64 = 96.0;
 const COMMAND_HEIGHT: f64 = 46.0;
-const SIGNAL_HEIGHT: f64 = 150.0;
+const SIGNAL_HEIGHT: f64 = 142.0;
 const ERROR_HEIGHT: f64 = 78.0;
-const INNER_GAP: f64 = 10.0;
-const ROW_GAP: f64 = 30.0;
+const INNER_GAP: f64 = 27.0;
+const ROW_GAP: f64 = 24.0;
 const FOOTER: f64 = 52.0;
 
 // Okabe and Ito's colours, told apart by people with any colour vision.
@@ -123,9 +123,9 @@ pub fn of_run(
     Ok(Picture {
         title: title.to_owned(),
         subtitle: format!(
-            "{} network on a window of {} ms ({} samples of {} sensors), trained on {} runs; this signal was never seen",
-            config.structure,
-            significant(config.window_s * 1e3),
+            "{} on a window of {:.0} ms ({} samples of {} sensors), trained on {} runs; this signal was never seen",
+            structure_name(&config.structure),
+            config.window_s * 1e3,
             config.window_steps,
             config.inputs.len(),
             config.provenance.train_runs,
@@ -137,6 +137,11 @@ pub fn of_run(
         commands,
         rows,
     })
+}
+
+/// A structure as people say it.
+fn structure_name(structure: &str) -> String {
+    if structure == "best" { "Network with linear skip".to_owned() } else { format!("{structure} network") }
 }
 
 /// `deflection_tip_y_m` as people say it: `Tip deflection y`.
@@ -299,13 +304,13 @@ impl Picture {
         self.line(svg, time, &value, self.first_row, &linear, BASELINE, 1.2)?;
         self.line(svg, time, &value, self.first_row, &network, ESTIMATE, 1.6)?;
         let mean = |errors: &[f64]| errors.iter().map(|e| e.abs()).sum::<f64>() / errors.len().max(1) as f64;
-        let x = WIDTH - RIGHT - 8.0;
+        let x = WIDTH - RIGHT;
         writeln!(
             svg,
-            "<text x=\"{x}\" y=\"{:.1}\" text-anchor=\"end\" font-size=\"12\" paint-order=\"stroke\" stroke=\"#ffffff\" stroke-width=\"4\">\
+            "<text x=\"{x}\" y=\"{:.1}\" text-anchor=\"end\" font-size=\"12\">\
              mean |error|: <tspan fill=\"{ESTIMATE}\" font-weight=\"600\">network {} {unit}</tspan>, \
              <tspan fill=\"#a96f00\">least squares {} {unit}</tspan></text>",
-            top + 15.0,
+            top - 8.0,
             significant(mean(&network)),
             significant(mean(&linear)),
             unit = escape(&row.unit)

@@ -102,7 +102,9 @@ fn body_text(out: &mut String, body: &BodySummary) -> std::fmt::Result {
         writeln!(out, "    all clamped    {} Hz", hertz(&basis.fixed_interface_hz))?;
         let lowest = &basis.reduced_hz[..basis.reduced_hz.len().min(6)];
         writeln!(out, "    frame clamped  {} Hz …", hertz(lowest))?;
-        writeln!(out, "    full model     {} Hz …", hertz(&basis.full_hz))?;
+        if !basis.full_hz.is_empty() {
+            writeln!(out, "    full model     {} Hz …", hertz(&basis.full_hz))?;
+        }
     }
     Ok(())
 }

@@ -97,7 +97,8 @@ pub fn mode_basis(
     })
 }
 
-/// First elastic frequencies of the free body, Hz: the six rigid motions are left out.
+/// First elastic frequencies of the free body, Hz, at most `count`: motions without strain are left
+/// out, six of a body in one piece. `scale_hz` is about where the first one is expected.
 ///
 /// # Errors
 /// As [`reduce`].
@@ -111,7 +112,9 @@ pub fn free_free_hz(
     let shift_per_s2 = (2.0 * std::f64::consts::PI * scale_hz).powi(2);
     let factor = StiffnessFactor::new(stiffness, mass, shift_per_s2, &vec![false; mass.node_count()])?;
     let modes = lowest_modes(&factor, mass, shift_per_s2, count + 6)?;
-    Ok(modes.omega_squared[6..].iter().copied().map(hertz).collect())
+    // rounding leaves rigid motions at about 1e-6 of the scale
+    let elastic = modes.omega_squared.iter().copied().map(hertz);
+    Ok(elastic.filter(|hz| *hz > 1e-3 * scale_hz).collect())
 }
 
 /// Lowest frequencies with the given nodes held, Hz.
