@@ -4,8 +4,8 @@
 //! cargo run --release -p hydroflex-dataset --example encode_cost -- DATASET
 //! ```
 //!
-//! DATASET is a data set of the boom. Its runs are repeated until there are about 2,000, then
-//! encoded in several ways on one thread; best of five.
+//! DATASET is a data set of the boom with some 2,000 runs; they are encoded in several ways on one
+//! thread, best of five. (Repeating fewer runs would let zstd find the repeats.)
 
 use arrow::array::{ArrayRef, Float32Array, Float64Array, RecordBatch};
 use arrow::datatypes::{DataType, Field, Schema};
@@ -22,8 +22,6 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
-const RUNS: usize = 2000;
-
 type Failure = Box<dyn std::error::Error>;
 
 fn main() -> Result<(), Failure> {
@@ -33,12 +31,9 @@ fn main() -> Result<(), Failure> {
     let loaded = dataset.load_all(&names)?;
     let records: Vec<RunRecord> = loaded
         .iter()
-        .cycle()
-        .take(RUNS)
-        .zip(0..)
-        .map(|(run, run_id)| RunRecord {
+        .map(|run| RunRecord {
             kind: RunKind::Job,
-            run_id,
+            run_id: run.run_id,
             seed: None,
             payload_kg: 0.0,
             angles_rad: vec![0.0; dataset.manifest().machine.angles.len()],
@@ -50,21 +45,16 @@ fn main() -> Result<(), Failure> {
             statistics: RunStatistics::default(),
         })
         .collect();
-    let samples: usize = loaded
-        .iter()
-        .cycle()
-        .take(RUNS)
-        .map(|run| run.sample_count * names.len())
-        .sum();
+    let samples: usize = loaded.iter().map(|run| run.sample_count * names.len()).sum();
     println!(
-        "{RUNS} runs ({} different), {} columns, {samples} samples",
-        loaded.len(),
+        "{} runs, {} columns, {samples} samples",
+        records.len(),
         names.len()
     );
     let report = |what: &str, seconds: f64, bytes: usize| {
         println!(
             "{what:44} {:8.1} us/run {:7.2} bytes/sample",
-            seconds / RUNS as f64 * 1e6,
+            seconds / records.len() as f64 * 1e6,
             bytes as f64 / samples as f64
         );
     };
@@ -77,14 +67,7 @@ fn main() -> Result<(), Failure> {
             sample_time_s: dataset.sample_time_s(),
             sample_type,
             split: Split::default(),
-            lengths: RunLengths::Listed(
-                loaded
-                    .iter()
-                    .cycle()
-                    .take(RUNS)
-                    .map(|r| r.sample_count as u64)
-                    .collect(),
-            ),
+            lengths: RunLengths::Listed(loaded.iter().map(|r| r.sample_count as u64).collect()),
         };
         let name = format!("{sample_type:?}").to_lowercase();
         let (seconds, shard) = best(|| {
