@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-use arrow::array::{Array, AsArray};
+use arrow::array::AsArray;
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Float64Type};
 use hydroflex_openapi::job::Integrator;
@@ -56,8 +56,11 @@ fn reference() -> Option<&'static Reference> {
         let folder = PathBuf::from(std::env::var_os("HYDROFLEX_REFERENCE")?).join("liftboom");
         let mesh = folder.join("Job-1.inp").to_str().unwrap().to_owned();
         let machine = Machine::load("lift-boom-published", &[mesh]).unwrap();
-        let runs: Value =
-            serde_json::from_str(&std::fs::read_to_string(folder.join("runs.json")).unwrap()).unwrap();
+        // Python writes NaN where a run has no convergence figure; JSON knows no such word.
+        let text = std::fs::read_to_string(folder.join("runs.json"))
+            .unwrap()
+            .replace("NaN", "null");
+        let runs: Value = serde_json::from_str(&text).unwrap();
         let runs = runs.get("runs").unwrap_or(&runs).as_array().unwrap().clone();
         let (columns, solution) = read_table(&folder.join("trajectories.parquet"));
         Some(Reference {
