@@ -24,7 +24,11 @@ impl Axis {
     #[must_use]
     pub fn ticks(&self, count: usize) -> Vec<f64> {
         let ticks = self.multiples(round_step((self.max - self.min) / count as f64));
-        if ticks.len() < 3 && count < 12 { self.ticks(count + 1) } else { ticks }
+        if ticks.len() < 3 && count < 12 {
+            self.ticks(count + 1)
+        } else {
+            ticks
+        }
     }
 
     fn multiples(&self, step: f64) -> Vec<f64> {

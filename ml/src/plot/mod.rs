@@ -141,7 +141,11 @@ pub fn of_run(
 
 /// A structure as people say it.
 fn structure_name(structure: &str) -> String {
-    if structure == "best" { "Network with linear skip".to_owned() } else { format!("{structure} network") }
+    if structure == "best" {
+        "Network with linear skip".to_owned()
+    } else {
+        format!("{structure} network")
+    }
 }
 
 /// `deflection_tip_y_m` as people say it: `Tip deflection y`.
