@@ -114,6 +114,7 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         workers: config.workers,
         trainer_threads: cores(),
         log: config.worker_log,
+        longest_stop: 2 * config.lease,
     })?;
     let address = listener.local_addr()?;
     let server = axum::serve(listener, http::router(state.clone()))

@@ -42,6 +42,10 @@ pub struct SuperviseConfig {
     pub trainer_threads: usize,
     /// File for what children say; ours if absent.
     pub log: Option<PathBuf>,
+    /// A child that is stopped (SIGSTOP) for longer is killed: it may hold the embedded database's
+    /// write lock, and with it everybody else. Longer than a lease, so that its shard is given up first
+    /// where that is possible.
+    pub longest_stop: Duration,
 }
 
 /// Running children. Dropping the handle stops them.
@@ -56,6 +60,7 @@ struct Slot {
     child: Option<(Child, Instant)>,
     pause: Duration,
     due: Instant,
+    stopped_since: Option<Instant>,
 }
 
 impl Supervisor {
@@ -109,6 +114,7 @@ fn supervise(config: &SuperviseConfig, stop: &AtomicBool, restarts: &AtomicU64) 
         child: None,
         pause: FIRST_PAUSE,
         due: now,
+        stopped_since: None,
     };
     let mut slots: Vec<Slot> = (0..config.workers).map(|_| slot("simulate")).collect();
     slots.push(slot("train"));
@@ -127,8 +133,20 @@ fn supervise(config: &SuperviseConfig, stop: &AtomicBool, restarts: &AtomicU64) 
 fn tend(slot: &mut Slot, config: &SuperviseConfig, started: &mut u64) {
     match &mut slot.child {
         Some((child, since)) => match child.try_wait() {
-            Ok(None) => {}
+            Ok(None) if is_stopped(child.id()) => {
+                let since = *slot.stopped_since.get_or_insert_with(Instant::now);
+                if since.elapsed() > config.longest_stop {
+                    tracing::warn!(
+                        role = slot.role,
+                        pid = child.id(),
+                        "a local process stands still; killing it"
+                    );
+                    let _ = child.kill();
+                }
+            }
+            Ok(None) => slot.stopped_since = None,
             Ok(Some(status)) => {
+                slot.stopped_since = None;
                 tracing::warn!(role = slot.role, pid = child.id(), %status, "a local process ended");
                 slot.pause = if since.elapsed() > SETTLED {
                     FIRST_PAUSE
@@ -154,6 +172,15 @@ fn tend(slot: &mut Slot, config: &SuperviseConfig, started: &mut u64) {
         },
         None => {}
     }
+}
+
+/// Whether a process was stopped by a signal: state `T` of `/proc/PID/stat`, the first field after the
+/// name in parentheses. A process that cannot be looked at counts as running.
+fn is_stopped(pid: u32) -> bool {
+    std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| {
+        stat.rsplit_once(") ")
+            .is_some_and(|(_, rest)| rest.starts_with('T'))
+    })
 }
 
 fn spawn(role: &str, config: &SuperviseConfig) -> io::Result<Child> {
