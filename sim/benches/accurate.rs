@@ -36,7 +36,10 @@ fn best_us(mut work: impl FnMut()) -> f64 {
 
 fn simulator() -> Simulator {
     let (name, meshes) = match std::env::var("HYDROFLEX_REFERENCE") {
-        Ok(folder) => ("lift-boom-published", vec![format!("{folder}/liftboom/Job-1.inp")]),
+        Ok(folder) => (
+            "lift-boom-published",
+            vec![format!("{folder}/liftboom/Job-1.inp")],
+        ),
         Err(_) => ("lift-boom", Vec::new()),
     };
     let machine = Machine::load(name, &meshes).expect("the machine loads");
@@ -47,7 +50,10 @@ fn simulator() -> Simulator {
 fn main() {
     let simulator = simulator();
     let file = simulator.machine().file().clone();
-    println!("{}, {RUNS} random runs of 1 s, µs of processor time per run", file.name);
+    println!(
+        "{}, {RUNS} random runs of 1 s, µs of processor time per run",
+        file.name
+    );
     println!("payload | steps rejected | alone | batch by instruction set");
     for payload_kg in [0.0, 50.0, 100.0] {
         let spec: JobSpec = serde_json::from_value(serde_json::json!({

@@ -117,14 +117,20 @@ fn both_paths_agree_at_small_steps() {
         let input = random_run(run_id, payload_kg, 60);
         let body = &simulator.reduced(payload_kg > 0.0).unwrap()[0];
         let model = PlanarModel::new(simulator.machine().file(), body, payload_kg > 0.0).unwrap();
-        let ours = model.run(&input, SAMPLE_S, 1e-4, &mut Workspace::default()).unwrap();
+        let ours = model
+            .run(&input, SAMPLE_S, 1e-4, &mut Workspace::default())
+            .unwrap();
         let theirs = simulator.run(&input, &general).unwrap();
         for (k, channel) in simulator.channels().iter().enumerate() {
             let (a, b) = (&ours.columns[k], &theirs.columns[k]);
             let most = b.iter().fold(f64::NEG_INFINITY, |m, &x| m.max(x));
             let least = b.iter().fold(f64::INFINITY, |m, &x| m.min(x));
             let off = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            let bound = if channel.name.contains("acceleration") { 5e-3 } else { 5e-4 };
+            let bound = if channel.name.contains("acceleration") {
+                5e-3
+            } else {
+                5e-4
+            };
             assert!(
                 off <= bound * (most - least),
                 "{}: {:.1e} of range in run {run_id}",

@@ -1,6 +1,9 @@
 //! The step loop of the accurate integrator leaves the heap alone: a run of twice the length
 //! allocates exactly as often.
-#![allow(unsafe_code, reason = "an allocator is unsafe by nature; this one counts and passes on")]
+#![allow(
+    unsafe_code,
+    reason = "an allocator is unsafe by nature; this one counts and passes on"
+)]
 
 use hydroflex_openapi::job::Integrator;
 use hydroflex_sim::machine::Machine;
@@ -63,7 +66,11 @@ fn a_longer_run_allocates_no_more_often() {
             let before = ALLOCATIONS.get();
             let results = simulator.run_batch(&inputs, &settings);
             let after = ALLOCATIONS.get();
-            assert!(results.iter().all(|r| r.as_ref().unwrap().sample_count == samples + 1));
+            assert!(
+                results
+                    .iter()
+                    .all(|r| r.as_ref().unwrap().sample_count == samples + 1)
+            );
             after - before
         };
         count(10);
