@@ -69,30 +69,25 @@ def assemble(x, tets, material):
     renumber = -np.ones(len(x), int)
     renumber[corners] = np.arange(len(corners))
     mesh = skfem.MeshTet(x[corners].T.copy(), renumber[tets[:, :4]].T.copy())
-    order = 1 if tets.shape[1] == 4 else 2
-    element = skfem.ElementVector(skfem.ElementTetP1() if order == 1 else skfem.ElementTetP2())
-    basis = skfem.Basis(mesh, element, intorder=2 * order)
+    midside = {}  # pair of corners -> our node between them
+    if tets.shape[1] == 10:
+        for k, (a, b) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]):
+            pairs = np.sort(renumber[tets[:, [a, b]]], axis=1)
+            midside.update(zip(map(tuple, pairs.tolist()), tets[:, 4 + k].tolist()))
+        # Isoparametric: the edges of a bore are curved.
+        mesh = skfem.MeshTet2.from_mesh(mesh)
+        for edge, node in zip(mesh.edges.T.tolist(), mesh.dofs.edge_dofs[0]):
+            mesh.doflocs[:, node] = x[midside[tuple(sorted(edge))]]
+    element = skfem.ElementVector(skfem.ElementTetP2() if midside else skfem.ElementTetP1())
+    basis = skfem.Basis(mesh, element, intorder=5 if midside else 2)
     stiffness = linear_elasticity(*lame_parameters(young, poisson)).assemble(basis)
     mass = density * skfem.BilinearForm(lambda u, v, w: skfem.helpers.dot(u, v)).assemble(basis)
-    # scikit-fem's dof of component c at our node i, found by position (straight-sided elements).
-    key = lambda p: tuple(np.round(p * 1e7).astype(int))
-    where = {}
-    locations = basis.doflocs.T
-    components = np.zeros(basis.N, int)
-    for c in range(3):
-        for table in (basis.nodal_dofs, basis.edge_dofs):
-            if len(table):
-                components[table[c]] = c
-    for dof in range(basis.N):
-        where.setdefault(key(locations[dof]), {})[components[dof]] = dof
     order_map = np.empty(3 * len(x), int)
-    for i, p in enumerate(x):
-        candidates = where.get(key(p))
-        if candidates is None:  # a rounded midside node: nearest
-            nearest = np.argmin(((locations - p) ** 2).sum(1))
-            candidates = where[key(locations[nearest])]
-        for c in range(3):
-            order_map[3 * i + c] = candidates[c]
+    for c in range(3):
+        order_map[3 * corners + c] = basis.nodal_dofs[c]
+        if midside:
+            nodes = np.array([midside[tuple(sorted(edge))] for edge in mesh.edges.T.tolist()])
+            order_map[3 * nodes + c] = basis.edge_dofs[c]
     assert len(np.unique(order_map)) == basis.N, "mesh nodes and finite-element nodes differ"
     return stiffness.tocsr()[order_map][:, order_map], mass.tocsr()[order_map][:, order_map]
 
