@@ -18,7 +18,7 @@ const BEAT: Duration = Duration::from_secs(1);
 /// How often a shard in work asks whether it is still wanted.
 const LOOK: Duration = Duration::from_millis(500);
 /// Longest wait between two looks for work.
-const LONGEST_IDLE: Duration = Duration::from_millis(250);
+const LONGEST_IDLE: Duration = Duration::from_millis(100);
 /// How long the database or the store may be away before a shard is given back.
 const PATIENCE: Duration = Duration::from_secs(60);
 

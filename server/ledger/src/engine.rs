@@ -166,7 +166,8 @@ macro_rules! bind_all {
 impl Pool {
     /// Connects; `sqlite:PATH` and `sqlite://PATH` make the file if it is absent.
     pub(crate) async fn connect(url: &str, connections: u32) -> Result<Self, LedgerError> {
-        if url.starts_with("sqlite:") {
+        if let Some(path) = url.strip_prefix("sqlite:") {
+            refuse_network_file_system(path)?;
             let options = SqliteConnectOptions::from_str(url)?
                 .create_if_missing(true)
                 .journal_mode(SqliteJournalMode::Wal)
@@ -293,5 +294,55 @@ impl Transaction {
             Self::Postgres(tx) => tx.commit().await?,
         }
         Ok(())
+    }
+}
+
+/// SQLite's locks and its write-ahead log need a file system of this machine: over a network two
+/// writers can both believe that they hold the lock.
+fn refuse_network_file_system(path: &str) -> Result<(), LedgerError> {
+    let path = path.trim_start_matches("//").split('?').next().unwrap_or_default();
+    let folder = match std::path::Path::new(path).parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => std::path::Path::new("."),
+    };
+    match nix::sys::statfs::statfs(folder) {
+        Ok(facts) => match network_name(facts.filesystem_type().0.cast_unsigned()) {
+            Some(name) => Err(LedgerError::NetworkFileSystem { folder: folder.to_owned(), name }),
+            None => Ok(()),
+        },
+        // A folder that is not there is told by whoever opens the file.
+        Err(_) => Ok(()),
+    }
+}
+
+/// Network file systems by the magic number of `statfs`, as in Linux' `magic.h`.
+fn network_name(magic: u64) -> Option<&'static str> {
+    match magic & 0xffff_ffff {
+        0x6969 => Some("NFS"),
+        0x517b | 0xff53_4d42 | 0xfe53_4d42 => Some("SMB"),
+        0x0102_1997 => Some("9p"),
+        0x00c3_6400 => Some("Ceph"),
+        0x0bd0_0bd0 => Some("Lustre"),
+        0x4750_4653 => Some("GPFS"),
+        0x1983_0326 => Some("BeeGFS"),
+        0x5346_414f => Some("AFS"),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_local_folder_is_accepted_and_a_network_file_system_named() {
+        assert!(refuse_network_file_system("/proc/../tmp/ledger.sqlite").is_ok());
+        assert!(refuse_network_file_system("//ledger.sqlite?mode=rwc").is_ok());
+        assert_eq!(network_name(0x6969), Some("NFS"));
+        assert_eq!(network_name(0xff53_4d42), Some("SMB"));
+        // ext, XFS, btrfs, tmpfs, overlay
+        for local in [0xef53, 0x5846_5342, 0x9123_683e, 0x0102_1994, 0x794c_7630] {
+            assert_eq!(network_name(local), None);
+        }
     }
 }

@@ -9,6 +9,18 @@ pub enum LedgerError {
         /// Text before the first colon.
         scheme: String,
     },
+    /// SQLite on a network file system.
+    #[error(
+        "{} is on {name}, a network file system, where SQLite is not safe; use a local directory, or PostgreSQL \
+         (--database postgres://…) for several machines",
+        folder.display()
+    )]
+    NetworkFileSystem {
+        /// Folder of the database.
+        folder: std::path::PathBuf,
+        /// Its file system.
+        name: &'static str,
+    },
     /// The database refused, or could not be reached.
     #[error("database: {0}")]
     Database(#[from] sqlx::Error),

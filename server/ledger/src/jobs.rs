@@ -184,8 +184,8 @@ impl Ledger {
     /// # Errors
     /// Passes on what the database says.
     pub async fn jobs(&self, before: Option<JobId>, limit: u64) -> Result<Vec<JobRecord>, LedgerError> {
-        // `~` sorts after every UUID.
-        let before = before.map_or_else(|| "~".to_owned(), |id| id.to_string());
+        // No hexadecimal digit sorts after `g`, in whatever order a database has for text.
+        let before = before.map_or_else(|| "g".to_owned(), |id| id.to_string());
         self.pool
             .rows(
                 "SELECT * FROM jobs WHERE id < $1 ORDER BY id DESC LIMIT $2",
@@ -269,6 +269,20 @@ impl Ledger {
 
     async fn end_job(&self, job: JobId, state: JobState, reason: &str) -> Result<bool, LedgerError> {
         let mut tx = self.pool.begin().await?;
+        // Shards and trainings before the job, as in every other transaction: two of them that lock
+        // the same rows in different order would wait for each other. A shard planned in between
+        // stays open, but nobody begins a shard of a job that is over.
+        tx.execute(
+            "UPDATE shards SET state = 'cancelled' WHERE job_id = $1 AND state IN ('open', 'running')",
+            values![job.to_string()],
+        )
+        .await?;
+        tx.execute(
+            "UPDATE trainings SET state = 'cancelled', reason = $2, finished_ms = $3 \
+             WHERE job_id = $1 AND state IN ('open', 'running')",
+            values![job.to_string(), reason, clock::now_ms()],
+        )
+        .await?;
         let ended = advance(
             &mut tx,
             job,
@@ -278,19 +292,7 @@ impl Ledger {
              AND state IN ('queued', 'simulating', 'publishing', 'training')",
         )
         .await?;
-        if ended {
-            tx.execute(
-                "UPDATE shards SET state = 'cancelled' WHERE job_id = $1 AND state IN ('open', 'running')",
-                values![job.to_string()],
-            )
-            .await?;
-            tx.execute(
-                "UPDATE trainings SET state = 'cancelled', reason = $2, finished_ms = $3 \
-                 WHERE job_id = $1 AND state IN ('open', 'running')",
-                values![job.to_string(), reason, clock::now_ms()],
-            )
-            .await?;
-        } else if tx.row(COLUMNS_OF_JOB, values![job.to_string()]).await?.is_none() {
+        if !ended && tx.row(COLUMNS_OF_JOB, values![job.to_string()]).await?.is_none() {
             return Err(LedgerError::NoJob { id: job.to_string() });
         }
         tx.commit().await?;

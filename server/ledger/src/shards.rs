@@ -231,7 +231,7 @@ impl Ledger {
             .pool
             .row(
                 "SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
-                 WHERE s.state = 'open' AND j.state IN ('queued', 'simulating') LIMIT 1",
+                 WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') LIMIT 1",
                 &[],
             )
             .await?;
@@ -243,14 +243,14 @@ impl Ledger {
             Engine::Sqlite => {
                 "UPDATE shards SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', worker = $1 \
                  WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
-                   WHERE s.state = 'open' AND j.state IN ('queued', 'simulating') \
+                   WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') \
                    ORDER BY j.priority DESC, j.id, s.kind DESC, s.first_run LIMIT 1) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
             }
             Engine::Postgres => {
                 "UPDATE shards SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', worker = $1 \
                  WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
-                   WHERE s.state = 'open' AND j.state IN ('queued', 'simulating') \
+                   WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') \
                    ORDER BY j.priority DESC, j.id, s.kind DESC, s.first_run LIMIT 1 \
                    FOR UPDATE OF s SKIP LOCKED) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
@@ -431,6 +431,50 @@ impl Ledger {
                 count_runs(&mut tx, shard.job_id, shard.kind, 1, 1, TimeSplit::default()).await?;
             }
         }
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    /// Has a committed shard done again, because its object is missing or damaged. Its job waits in
+    /// `publishing` until it is complete again. False if somebody else has done so.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn redo_shard(&self, id: ShardId, epoch: u64, reason: &str) -> Result<bool, LedgerError> {
+        let mut tx = self.pool.begin().await?;
+        let Some(row) = tx
+            .row(
+                "UPDATE shards SET state = 'open', worker = NULL, attempt = 0, object = NULL, reason = $3 \
+                 WHERE id = $1 AND epoch = $2 AND state = 'committed' RETURNING *",
+                values![id.to_string(), epoch, reason],
+            )
+            .await?
+        else {
+            return Ok(false);
+        };
+        let shard = ShardRecord::read(&row)?;
+        let statement = match shard.kind {
+            ShardKind::Runs => {
+                "UPDATE jobs SET runs_done = runs_done - $2, runs_failed = runs_failed - $3 \
+                 WHERE id = $1 AND state = 'publishing'"
+            }
+            ShardKind::Settling => {
+                "UPDATE jobs SET settling_done = settling_done - $2, runs_failed = runs_failed - 0 * $3 \
+                 WHERE id = $1 AND state = 'publishing'"
+            }
+        };
+        let values = values![shard.job_id.to_string(), shard.run_count, row.count("failed_runs")?];
+        if tx.execute(statement, values).await? == 0 {
+            return Ok(false);
+        }
+        let event = EventKind::ShardLost {
+            first_run: shard.first_run,
+            run_count: shard.run_count,
+            attempt: shard.attempt,
+            outcome: "retried".to_owned(),
+            reason: reason.to_owned(),
+        };
+        append(&mut tx, shard.job_id, &event).await?;
         tx.commit().await?;
         Ok(true)
     }

@@ -1,5 +1,7 @@
 //! One suite for every engine: what the ledger promises, whatever stands below it.
 
+mod postgres;
+
 use hydroflex_ledger::transition::{ATTEMPT_LIMIT, ShardState};
 use hydroflex_ledger::{
     CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, NewJob, NewModel, ShardKind,
@@ -56,7 +58,10 @@ fn new_dataset() -> NewDataset {
 
 async fn sqlite(folder: &tempfile::TempDir) -> Ledger {
     let url = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
-    let ledger = Ledger::create(&url).await.unwrap();
+    with_workers(Ledger::create(&url).await.unwrap()).await
+}
+
+async fn with_workers(ledger: Ledger) -> Ledger {
     for worker in ["a", "b"] {
         ledger.register_worker(worker).await.unwrap();
     }
@@ -75,6 +80,16 @@ macro_rules! on_every_engine {
                 }
             )*
         }
+        mod on_postgres {
+            $(
+                #[tokio::test(flavor = "multi_thread")]
+                async fn $name() {
+                    let Some(url) = super::postgres::fresh_database(stringify!($name)) else { return };
+                    let ledger = hydroflex_ledger::Ledger::create(&url).await.unwrap();
+                    super::$name(super::with_workers(ledger).await).await;
+                }
+            )*
+        }
     };
 }
 
@@ -89,6 +104,7 @@ on_every_engine![
     a_cancelled_job_takes_nothing_more,
     a_worker_that_is_given_up_holds_nothing,
     of_two_planners_one_wins,
+    a_shard_whose_object_is_lost_is_done_again,
     a_data_set_appears_once_with_its_trainings,
     a_failed_training_fails_its_job_and_keeps_the_data_set,
     many_workers_share_without_overlap,
@@ -320,6 +336,23 @@ async fn finish_runs(ledger: &Ledger, id: JobId) {
     }
     assert!(ledger.begin_publishing(id).await.unwrap());
     assert!(!ledger.begin_publishing(id).await.unwrap());
+}
+
+async fn a_shard_whose_object_is_lost_is_done_again(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[2, 2]), None).await.unwrap().id();
+    finish_runs(&ledger, id).await;
+    let shard = ledger.settled_shards(id, ShardKind::Runs, 0, 10).await.unwrap().remove(0);
+    assert!(ledger.redo_shard(shard.id, shard.epoch, "damaged").await.unwrap());
+    assert!(!ledger.redo_shard(shard.id, shard.epoch, "damaged").await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!((job.state, job.progress.runs_done, job.is_complete()), (JobState::Publishing, 2, false));
+    let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert_eq!((claim.shard.id, claim.shard.epoch), (shard.id, shard.epoch + 1));
+    ledger.commit_shard(&claim, &result(&claim.object())).await.unwrap();
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert!(job.is_complete());
+    assert_eq!(job.progress.runs_failed, 2);
+    assert!(ledger.publish_dataset(id, &new_dataset(), &[]).await.unwrap());
 }
 
 async fn a_data_set_appears_once_with_its_trainings(ledger: Ledger) {

@@ -28,8 +28,11 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use watch::Watch;
 
-/// How often the ledger is looked at when nobody calls.
-const TICK: Duration = Duration::from_millis(200);
+/// How often the ledger is looked at while a job is unfinished: a few reads of a local file, against
+/// workers that wait for their next shard.
+const BUSY_TICK: Duration = Duration::from_millis(50);
+/// And when there is none; whoever accepts a job calls.
+const IDLE_TICK: Duration = Duration::from_millis(500);
 
 /// Where a coordinator keeps things, and how patient it is.
 #[derive(Debug, Clone)]
@@ -169,16 +172,20 @@ impl Coordinator {
         let mut tasks = tokio::task::JoinSet::new();
         self.clear_scratch();
         loop {
-            if let Err(error) = self.tick(&mut watch, &mut tasks).await {
-                // The database may be restarting; nothing is lost by looking again.
-                tracing::warn!(%error, "the ledger could not be looked after; trying again");
-                tokio::time::sleep(Duration::from_secs(1)).await;
-            }
+            let pause = match self.tick(&mut watch, &mut tasks).await {
+                Ok(true) => BUSY_TICK,
+                Ok(false) => IDLE_TICK,
+                Err(error) => {
+                    // The database may be restarting; nothing is lost by looking again.
+                    tracing::warn!(%error, "the ledger could not be looked after; trying again");
+                    Duration::from_secs(1)
+                }
+            };
             while tasks.try_join_next().is_some() {}
             tokio::select! {
                 () = stop.cancelled() => break,
                 () = self.0.wake.notified() => {}
-                () = tokio::time::sleep(TICK) => {}
+                () = tokio::time::sleep(pause) => {}
             }
         }
         // Publishing is safe to cut off: nothing of it is visible before its last step.
@@ -196,7 +203,12 @@ impl Coordinator {
         }
     }
 
-    async fn tick(&self, watch: &mut Watch, tasks: &mut tokio::task::JoinSet<()>) -> Result<(), LedgerError> {
+    /// One look at everything. True while a job is unfinished.
+    async fn tick(
+        &self,
+        watch: &mut Watch,
+        tasks: &mut tokio::task::JoinSet<()>,
+    ) -> Result<bool, LedgerError> {
         let beats = self.ledger().beats().await?;
         for (worker, reason) in watch.look(Instant::now(), &beats) {
             tracing::warn!(worker, reason, "worker given up");
@@ -204,10 +216,13 @@ impl Coordinator {
         }
         self.ledger().recover_lost("its worker was given up").await?;
         let workers = self.worker_count(&beats);
-        for job in self.ledger().unfinished_jobs().await? {
+        let unfinished = self.ledger().unfinished_jobs().await?;
+        let busy = !unfinished.is_empty();
+        for job in unfinished {
             match job.state {
                 JobState::Queued | JobState::Simulating => self.advance(&job, workers).await?,
-                JobState::Publishing => self.publish_in_background(job, tasks),
+                // Incomplete again if an object turned out damaged and its shard is done anew.
+                JobState::Publishing if job.is_complete() => self.publish_in_background(job, tasks),
                 _ => {}
             }
         }
@@ -215,11 +230,11 @@ impl Coordinator {
             match self.blobs().delete_below(&format!("shards/{job}")).await {
                 Ok(_) => self.ledger().mark_collected(job).await?,
                 Err(error) => {
-                    tracing::warn!(%job, %error, "shard objects could not be deleted; trying again")
+                    tracing::warn!(%job, %error, "shard objects could not be deleted; trying again");
                 }
             }
         }
-        Ok(())
+        Ok(busy)
     }
 
     /// Workers that simulate; the configured number while none has reported.

@@ -265,7 +265,16 @@ async fn feed(
 async fn fetch(coordinator: &Coordinator, shard: &ShardRecord) -> Result<Feed, PublishFailure> {
     match (&shard.object, &shard.sha256) {
         (Some(object), Some(sha256)) if shard.state == ShardState::Committed => {
-            let content = coordinator.blobs().read(object, sha256).await?;
+            let content = match coordinator.blobs().read(object, sha256).await {
+                Ok(content) => content,
+                Err(error) => {
+                    if error.is_loss() {
+                        let reason = error.to_string();
+                        coordinator.ledger().redo_shard(shard.id, shard.epoch, &reason).await?;
+                    }
+                    return Err(error.into());
+                }
+            };
             Ok(Feed::Object {
                 name: object.clone(),
                 content,
