@@ -11,7 +11,8 @@ and the mesh are the only things shared with hydroflex.
         --scheme generalized-alpha --step-s 1e-4
 
 Exudyn's conventions differ in two switches of the machine file (`gravity_moment = "undeformed"`,
-`marker_rotation = "additive"`): compare with a copy of the file that sets them. Strain and stress are left
+`marker_rotation = "additive"`): compare with a copy of the file that sets them, and that
+weights interfaces uniformly (`weights = "uniform"`). Strain and stress are left
 out: Exudyn recovers them at corner nodes of linear meshes only. End stops and the vapour floor are not
 modelled here: choose runs that stay clear of both.
 """
@@ -142,6 +143,17 @@ class Boom:
         self.reduced = {}
         tip = next(s for s in machine["sensor"] if s["quantity"] == "deflection")
         self.tip = int(np.argmin(((self.x - np.array(tip["near_m"])) ** 2).sum(1)))
+        # The joint holds the mean of its interface's nodes: put the frame there, so that it holds the frame.
+        first = self.body["interface"][0]
+        nodes = self.sets[first["name"]]
+        self.x = self.x - self.weights(first, nodes) @ self.x[nodes]
+
+    def weights(self, interface, nodes):
+        """Marker weights; by area for linear tetrahedra only."""
+        if interface.get("weights") == "area":
+            assert self.tets.shape[1] == 4, "area weights are for linear meshes here: use uniform ones for both"
+            return area_weights(self.x, self.tets, nodes)
+        return np.full(len(nodes), 1 / len(nodes))
 
     def interface(self, payload):
         """Exudyn's reduced body on substitute nodes: one per interface (weighted mean) and the tip."""
@@ -158,8 +170,7 @@ class Boom:
         basis, position, names = [], [], []
         for i in self.body["interface"]:
             nodes = self.sets[i["name"]]
-            uniform = np.full(len(nodes), 1 / len(nodes))
-            w = area_weights(self.x, self.tets, nodes) if i.get("weights") == "area" and self.tets.shape[1] == 4 else uniform
+            w = self.weights(i, nodes)
             basis.append(sum(wk * cms.modeBasis[3 * n:3 * n + 3] for wk, n in zip(w, nodes)))
             position.append(w @ self.x[nodes])
             names.append(i["name"])
