@@ -101,46 +101,6 @@ fn neighbours_and_registers_change_no_bit() {
     }
 }
 
-/// Minimal and redundant coordinates describe the same machine: with small steps on both sides
-/// every channel agrees. Friction, full gravity moment and cavitation floor are those of the
-/// built-in boom. The general path's trapezoidal rule differs from its limit by about 3e-2 of range at
-/// 5 ms and falls with the square of the step, so by 3e-6 at 0.05 ms; kinks of the valve's metering
-/// edge inside a step cost more. Accelerations get ten times the bound.
-#[test]
-fn both_paths_agree_at_small_steps() {
-    let simulator = built_in();
-    let general = RunSettings {
-        integrator: Integrator::TrapezoidalIndex2 { step_s: 5e-5 },
-        sample_time_s: SAMPLE_S,
-    };
-    for (run_id, payload_kg) in [(3, 0.0), (4, 80.0)] {
-        let input = random_run(run_id, payload_kg, 60);
-        let body = &simulator.reduced(payload_kg > 0.0).unwrap()[0];
-        let model = PlanarModel::new(simulator.machine().file(), body, payload_kg > 0.0).unwrap();
-        let ours = model
-            .run(&input, SAMPLE_S, 1e-4, &mut Workspace::default())
-            .unwrap();
-        let theirs = simulator.run(&input, &general).unwrap();
-        for (k, channel) in simulator.channels().iter().enumerate() {
-            let (a, b) = (&ours.columns[k], &theirs.columns[k]);
-            let most = b.iter().fold(f64::NEG_INFINITY, |m, &x| m.max(x));
-            let least = b.iter().fold(f64::INFINITY, |m, &x| m.min(x));
-            let off = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            let bound = if channel.name.contains("acceleration") {
-                5e-3
-            } else {
-                5e-4
-            };
-            assert!(
-                off <= bound * (most - least),
-                "{}: {:.1e} of range in run {run_id}",
-                channel.name,
-                off / (most - least)
-            );
-        }
-    }
-}
-
 /// Random runs over the whole range of poses, payloads and signals end, with finite numbers, and a
 /// chamber never below vapour pressure. `HYDROFLEX_RUNS` asks for more of them.
 #[test]

@@ -52,7 +52,10 @@ impl BlobError {
     /// True if an object that was put is no longer there, or no longer what it was.
     #[must_use]
     pub fn is_loss(&self) -> bool {
-        matches!(self, Self::Damaged { .. } | Self::Store(object_store::Error::NotFound { .. }))
+        matches!(
+            self,
+            Self::Damaged { .. } | Self::Store(object_store::Error::NotFound { .. })
+        )
     }
 
     /// True if a put was refused because the object is there.

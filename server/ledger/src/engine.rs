@@ -300,14 +300,21 @@ impl Transaction {
 /// SQLite's locks and its write-ahead log need a file system of this machine: over a network two
 /// writers can both believe that they hold the lock.
 fn refuse_network_file_system(path: &str) -> Result<(), LedgerError> {
-    let path = path.trim_start_matches("//").split('?').next().unwrap_or_default();
+    let path = path
+        .trim_start_matches("//")
+        .split('?')
+        .next()
+        .unwrap_or_default();
     let folder = match std::path::Path::new(path).parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => std::path::Path::new("."),
     };
     match nix::sys::statfs::statfs(folder) {
         Ok(facts) => match network_name(facts.filesystem_type().0.cast_unsigned()) {
-            Some(name) => Err(LedgerError::NetworkFileSystem { folder: folder.to_owned(), name }),
+            Some(name) => Err(LedgerError::NetworkFileSystem {
+                folder: folder.to_owned(),
+                name,
+            }),
             None => Ok(()),
         },
         // A folder that is not there is told by whoever opens the file.

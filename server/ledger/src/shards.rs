@@ -463,7 +463,11 @@ impl Ledger {
                  WHERE id = $1 AND state = 'publishing'"
             }
         };
-        let values = values![shard.job_id.to_string(), shard.run_count, row.count("failed_runs")?];
+        let values = values![
+            shard.job_id.to_string(),
+            shard.run_count,
+            row.count("failed_runs")?
+        ];
         if tx.execute(statement, values).await? == 0 {
             return Ok(false);
         }

@@ -341,14 +341,24 @@ async fn finish_runs(ledger: &Ledger, id: JobId) {
 async fn a_shard_whose_object_is_lost_is_done_again(ledger: Ledger) {
     let id = ledger.create_job(&new_job(&[2, 2]), None).await.unwrap().id();
     finish_runs(&ledger, id).await;
-    let shard = ledger.settled_shards(id, ShardKind::Runs, 0, 10).await.unwrap().remove(0);
+    let shard = ledger
+        .settled_shards(id, ShardKind::Runs, 0, 10)
+        .await
+        .unwrap()
+        .remove(0);
     assert!(ledger.redo_shard(shard.id, shard.epoch, "damaged").await.unwrap());
     assert!(!ledger.redo_shard(shard.id, shard.epoch, "damaged").await.unwrap());
     let job = ledger.job(id).await.unwrap().unwrap();
-    assert_eq!((job.state, job.progress.runs_done, job.is_complete()), (JobState::Publishing, 2, false));
+    assert_eq!(
+        (job.state, job.progress.runs_done, job.is_complete()),
+        (JobState::Publishing, 2, false)
+    );
     let claim = ledger.begin_shard("a").await.unwrap().unwrap();
     assert_eq!((claim.shard.id, claim.shard.epoch), (shard.id, shard.epoch + 1));
-    ledger.commit_shard(&claim, &result(&claim.object())).await.unwrap();
+    ledger
+        .commit_shard(&claim, &result(&claim.object()))
+        .await
+        .unwrap();
     let job = ledger.job(id).await.unwrap().unwrap();
     assert!(job.is_complete());
     assert_eq!(job.progress.runs_failed, 2);

@@ -270,7 +270,10 @@ async fn fetch(coordinator: &Coordinator, shard: &ShardRecord) -> Result<Feed, P
                 Err(error) => {
                     if error.is_loss() {
                         let reason = error.to_string();
-                        coordinator.ledger().redo_shard(shard.id, shard.epoch, &reason).await?;
+                        coordinator
+                            .ledger()
+                            .redo_shard(shard.id, shard.epoch, &reason)
+                            .await?;
                     }
                     return Err(error.into());
                 }

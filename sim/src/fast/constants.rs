@@ -7,7 +7,7 @@ use hydroflex_openapi::machine::{CylinderSpec, EndStopSpec, FrictionSpec};
 /// `A` modes are those whose products enter the inertia (`sim/theory/minimal_coordinates.md`, §3).
 #[derive(Debug, Clone)]
 pub(super) struct Constants<const N: usize, const A: usize> {
-    /// Modes with a state of their own.
+    /// Modes in use.
     pub(super) used: usize,
     /// Modes with inertia products.
     pub(super) coupled: usize,
@@ -15,10 +15,8 @@ pub(super) struct Constants<const N: usize, const A: usize> {
     pub(super) inertia_kg_m2: f64,
     /// h₀: coupling of rotation and modes, √kg m.
     pub(super) h0: [f64; N],
-    /// Σ h₀² over the modes without inertia products.
-    pub(super) h0_rest2: f64,
-    /// c: first-order change of inertia, √kg m; of coupled modes.
-    pub(super) c: [f64; A],
+    /// c: first-order change of inertia, √kg m.
+    pub(super) c: [f64; N],
     /// B, symmetric.
     pub(super) b: [[f64; A]; A],
     /// C by columns: `cc[j][i]` = C_ij, antisymmetric.
@@ -37,15 +35,10 @@ pub(super) struct Constants<const N: usize, const A: usize> {
     pub(super) weight_axial: [f64; N],
     /// First moment Σ m (x, y) that gravity acts on, kg m.
     pub(super) moment_kg_m: [f64; 2],
-    /// Its change per coupled mode.
-    pub(super) moment: [[f64; A]; 2],
+    /// Its change per mode.
+    pub(super) moment: [[f64; N]; 2],
     /// Rows over the modes that sensors read.
     pub(super) sensors: Vec<[f64; N]>,
-    /// What modes that follow the cylinder force with a lag add to each of these rows, per
-    /// gravity x, gravity y, 1, and lagged force x, y, z.
-    pub(super) lagged_sensors: Vec<[f64; 6]>,
-    /// Reciprocal of that lag, 1/s; 0 if every mode has a state.
-    pub(super) lag_per_s: f64,
     /// One per sensor channel.
     pub(super) readouts: Vec<Readout>,
     /// Pivot to cylinder base in the global frame, m.

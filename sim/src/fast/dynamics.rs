@@ -19,8 +19,6 @@ pub(super) struct Point<L, const N: usize> {
     pub(super) v: [L; N],
     /// Piston side, rod side, Pa.
     pub(super) p: [L; 2],
-    /// Force along the cylinder with the lag of the stiff modes that have no state, N.
-    pub(super) lag: L,
 }
 
 impl<L: Lane, const N: usize> Point<L, N> {
@@ -33,7 +31,6 @@ impl<L: Lane, const N: usize> Point<L, N> {
             omega: zero,
             v: [zero; N],
             p: [zero; 2],
-            lag: zero,
         }
     }
 }
@@ -62,8 +59,6 @@ pub(super) struct Rates<L, const N: usize> {
     pub(super) p_raw: [L; 2],
     /// Pressure rates, Pa/s.
     pub(super) p: [L; 2],
-    /// Rate of the lagged force, N/s.
-    pub(super) lag: L,
     /// Eye-to-eye length, m.
     pub(super) length: L,
     /// Its rate, m/s.
@@ -109,7 +104,6 @@ impl<L: Lane, const N: usize> Rates<L, N> {
             a: [o; N],
             p_raw: [o; 2],
             p: [o; 2],
-            lag: o,
             length: o,
             speed: o,
             cylinder_force: o,
@@ -171,10 +165,9 @@ pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
     for i in 0..count {
         r.j[i] = n[0] * k(c.rod[0][i]) + n[1] * k(c.rod[1][i]) + n[2] * k(c.rod[2][i]);
     }
-    let [stretch] = sums(count, |i| [r.j[i] * y.v[i]]);
-    let coupled = L::trip(A, c.coupled);
-    let [cz, cv, sx, sy] = sums(coupled, |i| {
+    let [stretch, cz, cv, sx, sy] = sums(count, |i| {
         [
+            r.j[i] * y.v[i],
             y.z[i] * k(c.c[i]),
             y.v[i] * k(c.c[i]),
             y.z[i] * k(c.moment[0][i]),
@@ -185,7 +178,6 @@ pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
     r.moment = [sx + k(c.moment_kg_m[0]), sy + k(c.moment_kg_m[1])];
 
     hydraulics(&c.cylinder, y, opening, regime, r);
-    r.lag = (r.force - y.lag) * k(c.lag_per_s);
 
     // Modal forces without the couplings of the rotation
     let omega2 = y.omega * y.omega;
@@ -194,7 +186,8 @@ pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
         r.a[i] = gx * k(c.weight[0][i]) + gy * k(c.weight[1][i]) + k(c.weight_axial[i])
             - r.force * r.j[i]
             - y.z[i] * k(c.w2[i])
-            - y.v[i] * k(c.d[i]);
+            - y.v[i] * k(c.d[i])
+            + omega2 * k(c.c[i]);
     }
     let (bzz, bzv) = products(c, y, omega2, r);
     r.inertia = k(c.inertia_kg_m2) + (cz + cz) + bzz;
@@ -202,9 +195,8 @@ pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
     let torque = r.moment[0] * gy - r.moment[1] * gx - r.force * r.jt - coriolis;
 
     // Θ α + h·a = torque, h α + a = q
-    let [hq] = sums(count, |i| [r.h[i] * r.a[i]]);
-    let [hh] = sums(coupled, |i| [r.h[i] * r.h[i]]);
-    r.alpha = (torque - hq) / (r.inertia - hh - k(c.h0_rest2));
+    let [hq, hh] = sums(count, |i| [r.h[i] * r.a[i], r.h[i] * r.h[i]]);
+    r.alpha = (torque - hq) / (r.inertia - hh);
     for i in 0..count {
         r.a[i] -= r.h[i] * r.alpha;
     }
@@ -233,7 +225,7 @@ fn products<L: Lane, const N: usize, const A: usize>(
     let twice = y.omega + y.omega;
     for i in 0..coupled {
         r.h[i] -= cz[i];
-        r.a[i] += twice * cv[i] + omega2 * (L::splat(c.c[i]) + bz[i]);
+        r.a[i] += twice * cv[i] + omega2 * bz[i];
     }
     let [bzz, bzv] = sums(coupled, |i| [y.z[i] * bz[i], y.v[i] * bz[i]]);
     (bzz, bzv)

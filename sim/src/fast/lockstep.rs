@@ -16,9 +16,6 @@ use crate::trajectory::{RunFailure, RunInput, Trajectory};
 /// Result of one run of a batch.
 pub(super) type RunResult = Result<Trajectory, RunFailure>;
 
-/// Smallest tolerance at which stiff modes may lose their state; they cost 1e-4 at most.
-const LAGGING: f64 = 5e-4;
-
 /// What all runs of a batch have in common.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Common {
@@ -26,8 +23,6 @@ pub(super) struct Common {
     pub(super) sample_time_s: f64,
     /// Reciprocal squared local tolerance.
     pub(super) per_tolerance2: f64,
-    /// Stiff modes that hardly act back may follow the force with a lag.
-    pub(super) lagging: bool,
     /// Method.
     pub(super) method: &'static Tableau,
 }
@@ -41,7 +36,6 @@ impl Common {
         Self {
             sample_time_s,
             per_tolerance2: 1.0 / (local * local),
-            lagging: tolerance >= LAGGING,
             method: &RODAS5P,
         }
     }
@@ -123,19 +117,9 @@ pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
         step(c, common.method, &state, step_s, &regime, buffer);
         if tracks.iter().flatten().any(|t| t.record_due) {
             let count = L::trip(N, c.used);
-            let ([gx, gy], n) = (buffer.start.gravity, buffer.start.n);
-            let parts = [
-                gx,
-                gy,
-                L::splat(1.0),
-                n[0] * state.lag,
-                n[1] * state.lag,
-                n[2] * state.lag,
-            ];
-            for ((reading, row), lagged) in readings.iter_mut().zip(&c.sensors).zip(&c.lagged_sensors) {
+            for (reading, row) in readings.iter_mut().zip(&c.sensors) {
                 let [sum] = sums(count, |i| [state.z[i] * L::splat(row[i])]);
-                let [rest] = sums(6, |i| [parts[i] * L::splat(lagged[i])]);
-                *reading = sum + rest;
+                *reading = sum;
             }
         }
         let error2 = buffer.error2 * L::splat(common.per_tolerance2);
@@ -199,7 +183,6 @@ fn advance<L: Lane, const N: usize, const A: usize>(
 fn load<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Point<f64, N>, used: usize) {
     state.theta.set(lane, from.theta);
     state.omega.set(lane, from.omega);
-    state.lag.set(lane, from.lag);
     for i in 0..used {
         state.z[i].set(lane, from.z[i]);
         state.v[i].set(lane, from.v[i]);
@@ -218,7 +201,6 @@ fn take<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Po
     }
     state.theta.set(lane, from.theta.get(lane));
     state.omega.set(lane, from.omega.get(lane));
-    state.lag.set(lane, from.lag.get(lane));
     for i in 0..used {
         state.z[i].set(lane, from.z[i].get(lane));
         state.v[i].set(lane, from.v[i].get(lane));

@@ -159,7 +159,7 @@ impl PlanarModel {
         // The sizes that the loop is compiled for; padding modes are zero.
         macro_rules! sizes {
             ($(($modes:literal, $coupled:literal)),*) => {
-                $(if let Some(c) = self.constants::<$modes, $coupled>(modes, common.lagging) {
+                $(if let Some(c) = self.constants::<$modes, $coupled>(modes) {
                     match layout {
                         Layout::OneByOne => dispatch::one_by_one(set, &c, common, inputs, &fit, results),
                         Layout::SideBySide => dispatch::side_by_side(set, &c, common, inputs, &fit, results),

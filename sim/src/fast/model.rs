@@ -236,12 +236,8 @@ impl PlanarModel {
 
     /// Constants of the step loop for a payload, padded to `N` modes of which `A` have inertia
     /// products. `None` if the modes do not fit.
-    pub(super) fn constants<const N: usize, const A: usize>(
-        &self,
-        modes: &Modes,
-        lagging: bool,
-    ) -> Option<Constants<N, A>> {
-        self.ordered_constants(modes, &self.order(modes, lagging))
+    pub(super) fn constants<const N: usize, const A: usize>(&self, modes: &Modes) -> Option<Constants<N, A>> {
+        self.ordered_constants(modes, &self.order(modes))
     }
 
     /// The same for a given order of the modes.
@@ -251,8 +247,7 @@ impl PlanarModel {
         order: &Order,
     ) -> Option<Constants<N, A>> {
         let n = modes.w2.len();
-        let used = n - order.lagging;
-        if used > N || order.coupled > A {
+        if n > N || order.coupled > A {
             return None;
         }
         let phi = DMatrix::from_fn(n, n, |i, j| modes.phi[(i, order.columns[j])]);
@@ -268,8 +263,13 @@ impl PlanarModel {
         let row = |index: usize| rows.row(index) * &phi;
         let (px, py) = (row(0), row(1));
         let plane = |m: &Matrix3xX<f64>, index: usize| m.row(index) * &phi;
-        let pad = |x: &dyn Fn(usize) -> f64| padded::<N>(used, x);
-        let pad_coupled = |x: &dyn Fn(usize) -> f64| padded::<A>(order.coupled, x);
+        let pad = |x: &dyn Fn(usize) -> f64| {
+            let mut out = [0.0; N];
+            for (k, out) in out.iter_mut().enumerate().take(n) {
+                *out = x(k);
+            }
+            out
+        };
         let (h0, c) = (&self.h0 * &phi, &self.c * &phi);
         let weight = [0, 1, 2].map(|i| plane(&self.first_moment, i) + row(i) * m);
         let moment = [0, 1].map(|i| {
@@ -291,33 +291,16 @@ impl PlanarModel {
             }
             out
         };
-        let h0_of = |k: usize| h0[k] + m * (at.x * py[k] - at.y * px[k]);
-        let sensors: Vec<_> = self.sensors.rows.iter().map(|row| row * &phi).collect();
-        let w2 = |k: usize| modes.w2[order.columns[k]];
-        // z = (G·g − F Ψᵀn)/w² of the modes without state, in every row.
-        let lagged = |row: &RowDVector<f64>| {
-            let sum = |load: &dyn Fn(usize) -> f64| (used..n).map(|k| row[k] * load(k) / w2(k)).sum::<f64>();
-            [
-                sum(&|k| weight[0][k]),
-                sum(&|k| weight[1][k]),
-                sum(&|k| weight[2][k] * self.gravity_m_per_s2[2]),
-                sum(&|k| -rod[0][k]),
-                sum(&|k| -rod[1][k]),
-                sum(&|k| -rod[2][k]),
-            ]
-        };
-        let damping = |k: usize| modes.damping[order.columns[k]];
         Some(Constants {
-            used,
+            used: n,
             coupled: order.coupled,
             inertia_kg_m2: self.inertia_kg_m2 + m * (at.x * at.x + at.y * at.y),
-            h0: pad(&h0_of),
-            h0_rest2: (order.coupled..used).map(|k| h0_of(k) * h0_of(k)).sum(),
-            c: pad_coupled(&|k| c[k] + m * (at.x * px[k] + at.y * py[k])),
+            h0: pad(&|k| h0[k] + m * (at.x * py[k] - at.y * px[k])),
+            c: pad(&|k| c[k] + m * (at.x * px[k] + at.y * py[k])),
             b: square(&b),
             cc: square(&cc),
-            w2: pad(&w2),
-            d: pad(&damping),
+            w2: pad(&|k| modes.w2[order.columns[k]]),
+            d: pad(&|k| modes.damping[order.columns[k]]),
             rod: [0, 1, 2].map(|i| pad(&|k| rod[i][k])),
             rod_m: self.rod_m.into(),
             weight: [0, 1].map(|i| pad(&|k| weight[i][k])),
@@ -326,14 +309,16 @@ impl PlanarModel {
                 self.centre_moment_kg_m.x + m * at.x,
                 self.centre_moment_kg_m.y + m * at.y,
             ],
-            moment: [0, 1].map(|i| pad_coupled(&|k| moment[i][k])),
-            lagged_sensors: sensors.iter().map(lagged).collect(),
-            lag_per_s: if order.lagging > 0 {
-                w2(n - 1) / damping(n - 1)
-            } else {
-                0.0
-            },
-            sensors: sensors.iter().map(|row| pad(&|k| row[k])).collect(),
+            moment: [0, 1].map(|i| pad(&|k| moment[i][k])),
+            sensors: self
+                .sensors
+                .rows
+                .iter()
+                .map(|s| {
+                    let s = s * &phi;
+                    pad(&|k| s[k])
+                })
+                .collect(),
             readouts: self.sensors.readouts.clone(),
             base_m: self.base_m,
             gravity_m_per_s2: [self.gravity_m_per_s2[0], self.gravity_m_per_s2[1]],
@@ -364,7 +349,7 @@ impl PlanarModel {
     /// Modes by how far the machine's forces deflect them. Those of at least a five-hundredth of
     /// the largest have inertia products; the others change Θ and h by less than the products of
     /// their tiny amplitude (§3 of the theory page has the estimate, a test the proof).
-    pub(super) fn order(&self, modes: &Modes, lagging: bool) -> Order {
+    pub(super) fn order(&self, modes: &Modes) -> Order {
         let c = &self.cylinder;
         let force_n = (c.supply_pa - c.tank_pa).max(1.0) * c.area_m2[0];
         let g = Vector3::from(self.gravity_m_per_s2).norm();
@@ -384,71 +369,8 @@ impl PlanarModel {
             .iter()
             .take_while(|&&k| amplitude[k] >= COUPLED * largest)
             .count();
-        let mut order = Order {
-            columns,
-            coupled,
-            lagging: 0,
-        };
-        if lagging {
-            self.put_lagging_last(modes, &mut order);
-        }
-        order
+        Order { columns, coupled }
     }
-
-    /// Moves modes to the end that need no state of their own (§3 of the theory page): fast, over-damped,
-    /// with the same lag d/w², hardly moving the rod end, and hardly seen by a sensor beyond what
-    /// their lagged static deflection shows.
-    fn put_lagging_last(&self, modes: &Modes, order: &mut Order) {
-        let rod = &self.rod * &modes.phi;
-        let size = |k: usize| rod[(0, k)].abs().max(rod[(1, k)].abs());
-        let all = 0..modes.w2.len();
-        let flexibility: f64 = all.clone().map(|k| size(k) * size(k) / modes.w2[k]).sum();
-        let rows: Vec<_> = self.sensors.rows.iter().map(|row| row * &modes.phi).collect();
-        let seen = |row: &RowDVector<f64>, k: usize| row[k].abs() * size(k) / modes.w2[k];
-        let ranges: Vec<f64> = rows
-            .iter()
-            .map(|row| all.clone().map(|k| seen(row, k)).sum())
-            .collect();
-        let Some(stiffest) = all.clone().last() else {
-            return;
-        };
-        let lag = modes.damping[stiffest] / modes.w2[stiffest];
-        let lags = |k: usize| {
-            let fast = modes.damping[k];
-            // What leaving out the mode's own inertia does to its deflection, at the usual rates.
-            let error = USUAL_RATE_PER_S / fast;
-            lag > 0.0
-                && (modes.damping[k] / modes.w2[k] / lag - 1.0).abs() < 1e-6
-                && error < 0.05
-                && size(k) * size(k) / modes.w2[k] < 1e-4 * flexibility
-                && rows
-                    .iter()
-                    .zip(&ranges)
-                    .all(|(row, range)| seen(row, k) * error <= 1e-4 * range)
-        };
-        let (mut last, mut first): (Vec<usize>, Vec<usize>) = order.columns[order.coupled..]
-            .iter()
-            .copied()
-            .partition(|&k| lags(k));
-        // The stiffest of them names the lag.
-        last.sort_unstable();
-        order.lagging = last.len();
-        order.columns.truncate(order.coupled);
-        order.columns.append(&mut first);
-        order.columns.append(&mut last);
-    }
-}
-
-/// Rate of change of forces that a run usually has, 1/s: a vibration of 80 Hz.
-const USUAL_RATE_PER_S: f64 = 500.0;
-
-/// The first `used` values, then zeros.
-fn padded<const N: usize>(used: usize, x: &dyn Fn(usize) -> f64) -> [f64; N] {
-    let mut out = [0.0; N];
-    for (k, out) in out.iter_mut().enumerate().take(used) {
-        *out = x(k);
-    }
-    out
 }
 
 /// Smallest amplitude, over the largest, of a mode with inertia products.
@@ -461,8 +383,6 @@ pub(super) struct Order {
     pub(super) columns: Vec<usize>,
     /// How many of the first have inertia products.
     pub(super) coupled: usize,
-    /// How many of the last have no state.
-    pub(super) lagging: usize,
 }
 
 /// Modes of the body with one payload.

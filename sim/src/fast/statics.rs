@@ -56,7 +56,6 @@ pub(super) fn rest<const N: usize, const A: usize>(
         }
         // Two equal corrections in a row are rounding.
         if step.abs() < 1e-16 || (step.abs() < 1e-12 && step.abs() >= correction) {
-            y.lag = force;
             y.p = holding_pressures(c, force - (r.force - r.cylinder_force));
             return Ok(Rest { state: y, length_m });
         }

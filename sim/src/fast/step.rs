@@ -72,7 +72,6 @@ pub(super) fn step<L: Lane, const N: usize, const A: usize>(
         };
         w.rhs.theta += w.next.omega;
         w.rhs.omega += at.alpha;
-        w.rhs.lag += at.lag;
         for i in 0..count {
             w.rhs.z[i] += w.next.v[i];
             w.rhs.v[i] += at.a[i];
@@ -102,106 +101,115 @@ fn gather<L: Lane, const N: usize>(
     inverse_h: L,
     w: &mut StepBuffer<L, N>,
 ) {
-    let (next, rhs) = (&mut w.next, &mut w.rhs);
+    let (a, c) = (&method.a[stage], &method.c[stage]);
     let u = &w.increments[..stage];
-    let weights = Weights {
-        a: &method.a[stage],
-        c: &method.c[stage],
-        chained: stage >= method.chain,
-        inverse_h,
-    };
-    macro_rules! one {
-        ($($field:tt)+) => {
-            (next.$($field)+, rhs.$($field)+) =
-                weights.one(u, y.$($field)+, next.$($field)+, |u: &Point<L, N>| u.$($field)+);
-        };
+    macro_rules! combine {
+        ($from:expr, $get:expr) => {{
+            let get = $get;
+            let mut argument = $from;
+            let mut carried = L::splat(0.0);
+            for (j, u) in u.iter().enumerate() {
+                let x: L = get(u);
+                argument += x * L::splat(a[j]);
+                carried += x * L::splat(c[j]);
+            }
+            (argument, carried * inverse_h)
+        }};
     }
-    one!(theta);
-    one!(omega);
-    one!(lag);
-    one!(p[0]);
-    one!(p[1]);
-    weights.array(count, u, &y.z, &mut next.z, &mut rhs.z, |u| &u.z);
-    weights.array(count, u, &y.v, &mut next.v, &mut rhs.v, |u| &u.v);
+    let chained = stage >= method.chain;
+    let (theta, rhs_theta) = combine!(y.theta, |u: &Point<L, N>| u.theta);
+    let (omega, rhs_omega) = combine!(y.omega, |u: &Point<L, N>| u.omega);
+    w.rhs.theta = rhs_theta;
+    w.rhs.omega = rhs_omega;
+    let previous = if chained { Some(&u[stage - 1]) } else { None };
+    w.next.theta = previous.map_or(theta, |u| w.next.theta + u.theta);
+    w.next.omega = previous.map_or(omega, |u| w.next.omega + u.omega);
+    for i in 0..2 {
+        let (p, rhs) = combine!(y.p[i], |u: &Point<L, N>| u.p[i]);
+        w.rhs.p[i] = rhs;
+        w.next.p[i] = previous.map_or(p, |u| w.next.p[i] + u.p[i]);
+    }
+    blocks(
+        a,
+        c,
+        u,
+        count,
+        inverse_h,
+        |u| &u.z,
+        &y.z,
+        chained,
+        &mut w.next.z,
+        &mut w.rhs.z,
+    );
+    blocks(
+        a,
+        c,
+        u,
+        count,
+        inverse_h,
+        |u| &u.v,
+        &y.v,
+        chained,
+        &mut w.next.v,
+        &mut w.rhs.v,
+    );
 }
 
-/// Coefficients of one stage.
-struct Weights<'a, L> {
-    a: &'a [f64; STAGES],
-    c: &'a [f64; STAGES],
-    /// The argument is the previous one plus the previous increment.
-    chained: bool,
+/// The same for an array of modes, four at a time.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "an inlined piece of one loop")]
+fn blocks<L: Lane, const N: usize>(
+    a: &[f64; STAGES],
+    c: &[f64; STAGES],
+    u: &[Point<L, N>],
+    count: usize,
     inverse_h: L,
-}
-
-impl<L: Lane> Weights<'_, L> {
-    /// Argument and carried sum of one number.
-    #[inline(always)]
-    fn one<U>(&self, u: &[U], from: L, previous: L, get: impl Fn(&U) -> L) -> (L, L) {
-        let mut argument = from;
-        let mut carried = L::splat(0.0);
+    get: impl Fn(&Point<L, N>) -> &[L; N],
+    from: &[L; N],
+    chained: bool,
+    argument: &mut [L; N],
+    carried: &mut [L; N],
+) {
+    let zero = L::splat(0.0);
+    let whole = count - count % 4;
+    let mut start = 0;
+    while start < whole {
+        let mut sum_a = [zero; 4];
+        let mut sum_c = [zero; 4];
+        for i in 0..4 {
+            sum_a[i] = from[start + i];
+        }
         for (j, u) in u.iter().enumerate() {
             let x = get(u);
-            carried += x * L::splat(self.c[j]);
-            if !self.chained {
-                argument += x * L::splat(self.a[j]);
-            }
-        }
-        if let (true, Some(last)) = (self.chained, u.last()) {
-            argument = previous + get(last);
-        }
-        (argument, carried * self.inverse_h)
-    }
-
-    /// The same for an array over modes, four at a time.
-    #[inline(always)]
-    fn array<U, const N: usize>(
-        &self,
-        count: usize,
-        u: &[U],
-        from: &[L; N],
-        argument: &mut [L; N],
-        carried: &mut [L; N],
-        get: impl Fn(&U) -> &[L; N],
-    ) {
-        let zero = L::splat(0.0);
-        let whole = count - count % 4;
-        let mut start = 0;
-        while start < whole {
-            let mut sum_c = [zero; 4];
-            if let (true, Some(last)) = (self.chained, u.last()) {
-                for (j, u) in u.iter().enumerate() {
-                    for i in 0..4 {
-                        sum_c[i] += get(u)[start + i] * L::splat(self.c[j]);
-                    }
-                }
-                for i in 0..4 {
-                    argument[start + i] += get(last)[start + i];
-                }
-            } else {
-                let mut sum_a = [zero; 4];
-                for i in 0..4 {
-                    sum_a[i] = from[start + i];
-                }
-                for (j, u) in u.iter().enumerate() {
-                    for i in 0..4 {
-                        let x = get(u)[start + i];
-                        sum_c[i] += x * L::splat(self.c[j]);
-                        sum_a[i] += x * L::splat(self.a[j]);
-                    }
-                }
-                for i in 0..4 {
-                    argument[start + i] = sum_a[i];
-                }
-            }
             for i in 0..4 {
-                carried[start + i] = sum_c[i] * self.inverse_h;
+                sum_a[i] += x[start + i] * L::splat(a[j]);
+                sum_c[i] += x[start + i] * L::splat(c[j]);
             }
-            start += 4;
         }
-        for i in whole..count {
-            (argument[i], carried[i]) = self.one(u, from[i], argument[i], |u| get(u)[i]);
+        for i in 0..4 {
+            argument[start + i] = if chained {
+                argument[start + i] + get(&u[u.len() - 1])[start + i]
+            } else {
+                sum_a[i]
+            };
+            carried[start + i] = sum_c[i] * inverse_h;
         }
+        start += 4;
+    }
+    for i in whole..count {
+        let mut sum_a = from[i];
+        let mut sum_c = zero;
+        for (j, u) in u.iter().enumerate() {
+            let x = get(u)[i];
+            sum_a += x * L::splat(a[j]);
+            sum_c += x * L::splat(c[j]);
+        }
+        argument[i] = if chained {
+            argument[i] + get(&u[u.len() - 1])[i]
+        } else {
+            sum_a
+        };
+        carried[i] = sum_c * inverse_h;
     }
 }
 
@@ -216,7 +224,6 @@ fn add<L: Lane, const N: usize>(count: usize, y: &mut Point<L, N>, u: &Point<L, 
     for i in 0..2 {
         y.p[i] += u.p[i];
     }
-    y.lag += u.lag;
 }
 
 /// Σ (error / scale)² over pressures, rod travel, rod speed and strain energy.

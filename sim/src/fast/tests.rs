@@ -79,7 +79,7 @@ fn fixture() -> Fixture {
     let body = cloud.reduce(4e4, 1e-3);
     let model = PlanarModel::new(&machine(), &body, true).unwrap();
     let modes = model.modes(PAYLOAD_KG).unwrap();
-    let mut order = model.order(&modes, false);
+    let mut order = model.order(&modes);
     order.coupled = MODES;
     let constants = model.ordered_constants(&modes, &order).unwrap();
     Fixture {

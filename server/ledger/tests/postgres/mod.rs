@@ -21,7 +21,12 @@ pub(crate) fn fresh_database(name: &str) -> Option<String> {
     // PostgreSQL cuts names at 63 bytes; ours differ before.
     let name: String = name.chars().take(60).collect();
     let made = as_postgres(&server.programs.join("createdb"))
-        .args(["--host", &server.folder.display().to_string(), "--port", &server.port.to_string()])
+        .args([
+            "--host",
+            &server.folder.display().to_string(),
+            "--port",
+            &server.port.to_string(),
+        ])
         .args(["--username=postgres", &name])
         .status()
         .unwrap();
@@ -33,7 +38,9 @@ pub(crate) fn fresh_database(name: &str) -> Option<String> {
 fn as_postgres(program: &Path) -> Command {
     if is_root() {
         let mut command = Command::new("setpriv");
-        command.args(["--reuid=postgres", "--regid=postgres", "--init-groups", "--"]).arg(program);
+        command
+            .args(["--reuid=postgres", "--regid=postgres", "--init-groups", "--"])
+            .arg(program);
         command
     } else {
         Command::new(program)
@@ -46,7 +53,10 @@ fn is_root() -> bool {
 
 fn programs() -> Option<PathBuf> {
     let versions = std::fs::read_dir("/usr/lib/postgresql").ok()?;
-    versions.flatten().map(|version| version.path().join("bin")).find(|bin| bin.join("initdb").is_file())
+    versions
+        .flatten()
+        .map(|version| version.path().join("bin"))
+        .find(|bin| bin.join("initdb").is_file())
 }
 
 fn start() -> Option<Server> {
@@ -56,18 +66,32 @@ fn start() -> Option<Server> {
     };
     let folder = tempfile::tempdir().unwrap().keep();
     if is_root() {
-        let owned = Command::new("chown").arg("postgres").arg(&folder).status().unwrap();
+        let owned = Command::new("chown")
+            .arg("postgres")
+            .arg(&folder)
+            .status()
+            .unwrap();
         assert!(owned.success());
     }
     let data = folder.join("data");
     let made = as_postgres(&programs.join("initdb"))
-        .args(["--username=postgres", "--auth=trust", "--encoding=UTF8", "--no-sync", "--pgdata"])
+        .args([
+            "--username=postgres",
+            "--auth=trust",
+            "--encoding=UTF8",
+            "--no-sync",
+            "--pgdata",
+        ])
         .arg(&data)
         .stdout(Stdio::null())
         .status()
         .unwrap();
     assert!(made.success(), "initdb");
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port();
     let mut server = as_postgres(&programs.join("postgres"));
     server
         .arg("-D")
@@ -86,9 +110,16 @@ fn start() -> Option<Server> {
             .status()
             .unwrap();
         if ready.success() {
-            return Some(Server { port, programs, folder });
+            return Some(Server {
+                port,
+                programs,
+                folder,
+            });
         }
-        assert!(start.elapsed() < Duration::from_secs(60), "PostgreSQL does not start");
+        assert!(
+            start.elapsed() < Duration::from_secs(60),
+            "PostgreSQL does not start"
+        );
         std::thread::sleep(Duration::from_millis(50));
     }
 }
