@@ -4,6 +4,11 @@
 //! exponential is a degree-6 polynomial after range reduction (error below 2 ulp), which the scalar
 //! library function would not let the compiler vectorise.
 
+#![allow(
+    clippy::inline_always,
+    reason = "vector code has to be inlined into the function that enables the instructions"
+)]
+
 use hydroflex_openapi::model::Activation;
 
 /// Below this e^x is 0 in f32 and above its negative ∞; the reduction stays exact between.

@@ -5,6 +5,11 @@
 //! all inputs; then bias and activation follow while the values are still in cache. The same body
 //! is compiled for AVX-512, AVX2 + FMA and the baseline, and chosen once per process.
 
+#![allow(
+    clippy::inline_always,
+    reason = "vector code has to be inlined into the function that enables the instructions"
+)]
+
 use crate::model::weights::LinearWeights;
 use crate::network::elementwise::activate;
 use hydroflex_openapi::model::Activation;

@@ -5,6 +5,11 @@
 //! p ← p − η m / (1 − β₁ᵗ) / (√(v / (1 − β₂ᵗ)) + ε)
 //! ```
 
+#![allow(
+    clippy::inline_always,
+    reason = "vector code has to be inlined into the function that enables the instructions"
+)]
+
 /// β₁, the usual value.
 const BETA_1: f32 = 0.9;
 /// β₂, the usual value.

@@ -1,5 +1,10 @@
 //! The `accurate` integrator of machines with one degree of freedom in the plane: one flexible body
 //! on a revolute joint to the ground, one cylinder, perhaps a payload.
+
+#![allow(
+    clippy::inline_always,
+    reason = "vector code has to be inlined into the function that enables the instructions"
+)]
 #![doc = include_str!("../../theory/minimal_coordinates.md")]
 
 mod constants;
