@@ -1,6 +1,6 @@
 //! What a service holds: data sets, models, machines.
 
-use crate::id::{DatasetId, JobId, ModelId, TrainingId};
+use crate::id::{AliasName, DatasetId, JobId, ModelId, TrainingId};
 use crate::job::{JobSpec, TrainingSpec};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -77,6 +77,35 @@ pub struct ModelPage {
     /// Ask with this `cursor` for the next page; absent on the last.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_cursor: Option<String>,
+}
+
+/// Where an alias is to point.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct AliasRequest {
+    /// The model; it is loaded and checked before the alias moves.
+    pub model_id: ModelId,
+}
+
+/// An alias: a name for a model that can be moved to another one.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AliasInfo {
+    /// Its name.
+    pub alias: AliasName,
+    /// The model that it points at.
+    pub model_id: ModelId,
+    /// Counts from 1 with every move; also the ETag. Earlier ones stay addressable as versions of
+    /// the Open Inference Protocol.
+    pub generation: u64,
+    /// When it was moved there (RFC 3339, UTC).
+    pub moved_at: String,
+}
+
+/// Every alias, by name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AliasList {
+    /// Aliases.
+    pub aliases: Vec<AliasInfo>,
 }
 
 /// A machine that the service carries.

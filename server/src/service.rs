@@ -117,13 +117,12 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         longest_stop: 2 * config.lease,
     })?;
     let address = listener.local_addr()?;
-    let server = axum::serve(listener, http::router(state.clone()))
-        .with_graceful_shutdown(stop.clone().cancelled_owned());
+    let server = http::serve::serve(listener, http::router(state.clone()), stop.clone());
     Ok(Service {
         address,
         state,
         coordinator: tokio::spawn(coordinator.run(stop.clone())),
-        server: tokio::spawn(server.into_future()),
+        server: tokio::spawn(server),
         stop,
         supervisor,
         _lock: lock,

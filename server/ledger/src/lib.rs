@@ -5,7 +5,7 @@
 //!
 //! - `transition`: the life of a shard as a pure function
 //! - `engine`: SQLite and PostgreSQL behind one small surface
-//! - `jobs`, `shards`, `workers`, `artefacts`, `events`: what can be done, one transaction each
+//! - `jobs`, `shards`, `workers`, `artefacts`, `aliases`, `events`: what can be done, one transaction each
 //! - `blobs`: objects in a directory or an object store
 //! - `crash`: places where tests let a process die
 //!
@@ -20,12 +20,14 @@ mod jobs;
 mod shards;
 mod workers;
 mod artefacts;
+mod aliases;
 mod events;
 pub mod blobs;
 pub mod crash;
 pub mod identity;
 pub mod clock;
 
+pub use aliases::{AliasCondition, AliasMove, AliasRecord};
 pub use artefacts::{NewDataset, NewModel, TrainingClaim};
 pub use engine::Engine;
 pub use error::LedgerError;
@@ -37,7 +39,10 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 1] = [include_str!("../migrations/0001_ledger.sql")];
+const SCHEMA: [&str; 2] = [
+    include_str!("../migrations/0001_ledger.sql"),
+    include_str!("../migrations/0002_aliases.sql"),
+];
 
 /// The shared record of what is to be done and what is done.
 #[derive(Clone)]

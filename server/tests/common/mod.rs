@@ -4,6 +4,8 @@
 )]
 //! The whole router around a ledger and a store in a temporary directory; no workers, no sockets.
 
+pub(crate) mod models;
+
 use axum::Router;
 use axum::body::Body;
 use axum::http::{HeaderMap, Request, StatusCode};
@@ -75,6 +77,19 @@ impl Desk {
             headers: parts.headers,
             body,
         }
+    }
+
+    /// Serves on a free port until the test ends.
+    pub(crate) async fn listen(&self) -> std::net::SocketAddr {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let stop = tokio_util::sync::CancellationToken::new();
+        tokio::spawn(hydroflex_server::http::serve::serve(
+            listener,
+            self.router.clone(),
+            stop,
+        ));
+        address
     }
 
     pub(crate) async fn get(&self, path: &str) -> Answer {
