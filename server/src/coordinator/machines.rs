@@ -73,6 +73,11 @@ fn refusal(spec: &JobSpec, refused: &RefusedMachine) -> FieldError {
     }
 }
 
+/// Random configurations looked at before a job is accepted, and the part of them from which the machine must be able
+/// to start. A run draws up to a thousand times.
+const REACH_DRAWS: u64 = 100;
+const REACH_LEAST: f64 = 0.05;
+
 impl CheckedMachine {
     /// SHA-256 of the machine, hexadecimal.
     #[must_use]
@@ -91,7 +96,22 @@ impl CheckedMachine {
     /// # Errors
     /// The fields at fault.
     pub fn validate(&self, spec: &JobSpec) -> Result<(), Vec<FieldError>> {
-        scenario::validate(spec, self.0.machine().file())
+        let file = self.0.machine().file();
+        scenario::validate(spec, file)?;
+        let part = scenario::reachable_part(spec, file, &self.0.simulator, REACH_DRAWS);
+        if part < REACH_LEAST {
+            return Err(vec![FieldError::new(
+                "/initial_angle_deg",
+                format!(
+                    "{:?}: in {:.0} of {REACH_DRAWS} random configurations a cylinder starts outside the lengths it may \
+                     start at; choose ranges in which at least {} % can start",
+                    spec.initial_angle_deg,
+                    (1.0 - part) * REACH_DRAWS as f64,
+                    100.0 * REACH_LEAST,
+                ),
+            )]);
+        }
+        Ok(())
     }
 
     /// What decides the bytes of a job's data set, beside its runs.
