@@ -15,6 +15,7 @@ pub mod predict;
 pub mod aliases;
 pub mod inference;
 pub mod machines;
+pub mod meshes;
 pub mod operations;
 pub mod serve;
 
@@ -38,7 +39,7 @@ use tower_http::compression::predicate::{NotForContentType, Predicate, SizeAbove
 use tower_http::decompression::RequestDecompressionLayer;
 use tower_http::timeout::RequestBodyTimeoutLayer;
 use utoipa::OpenApi;
-use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
 use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
 
@@ -140,6 +141,7 @@ fn routes() -> OpenApiRouter<AppState> {
         .merge(prediction_routes())
         .routes(routes!(machines::list))
         .routes(routes!(machines::show))
+        .routes(routes!(meshes::upload).layer(DefaultBodyLimit::max(meshes::MESH_LIMIT_BYTES)))
         .routes(routes!(operations::live))
         .routes(routes!(operations::ready))
         .routes(routes!(operations::metrics))
