@@ -63,6 +63,12 @@ fn refusal(reference: &MachineRef, refused: &RefusedMachine) -> FieldError {
 }
 
 impl CheckedMachine {
+    /// A machine that a worker would simulate.
+    #[must_use]
+    pub fn new(ready: Arc<ReadyMachine>) -> Self {
+        Self(ready)
+    }
+
     /// SHA-256 of the machine, hexadecimal.
     #[must_use]
     pub fn sha256(&self) -> &str {
@@ -80,12 +86,25 @@ impl CheckedMachine {
     /// # Errors
     /// The fields at fault.
     pub fn validate(&self, spec: &JobSpec) -> Result<(), Vec<FieldError>> {
-        scenario::validate(spec, self.0.machine().file())
+        let mut errors = match scenario::validate(spec, self.0.machine().file()) {
+            Ok(()) => Vec::new(),
+            Err(errors) => errors,
+        };
+        if !JobSpec::PRIORITIES.contains(&spec.priority) {
+            errors.push(
+                FieldError::new("/priority", "not a priority")
+                    .value(spec.priority)
+                    .allowed("-100 to 100"),
+            );
+        }
+        if errors.is_empty() { Ok(()) } else { Err(errors) }
     }
 
     /// What decides the bytes of a job's data set, beside its runs.
     #[must_use]
     pub fn publish_spec(&self, spec: JobSpec) -> PublishSpec {
+        // When a job's turn comes changes no byte of what it makes.
+        let spec = JobSpec { priority: 0, ..spec };
         let file = self.0.machine().file();
         let machine = MachineFacts {
             name: file.name.clone(),
