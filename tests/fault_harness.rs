@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! cargo test --release --workspace --test fault_harness -- --nocapture                 a few dozen faults
-//! HYDROFLEX_FAULTS=1000 HYDROFLEX_FAULT_REPORT=docs/faults.md cargo test … (the same)  a long night
+//! HYDROFLEX_FAULTS=1000 HYDROFLEX_FAULT_REPORT=$PWD/docs/faults.md cargo test … (the same)  a long night
 //! ```
 //!
 //! `HYDROFLEX_FAULT_SEED` repeats the choices of a trial: which fault, on whom, when. What a fault meets
@@ -30,7 +30,7 @@ const SHORT: usize = 40;
 
 /// Faults of one trial. A shard is halved after four lost attempts and a lone run given up after four
 /// more: with a handful of faults per job, no run can be given up by bad luck alone.
-const PER_TRIAL: usize = 10;
+const PER_TRIAL: usize = 14;
 
 const RUNS: u64 = 600;
 
@@ -738,6 +738,9 @@ fn random_faults_lose_nothing_and_change_no_byte() {
         for (fault, count) in &trial.counts {
             *tally.faults.entry((*fault, setup)).or_default() += count;
         }
+        if let Some(path) = std::env::var_os("HYDROFLEX_FAULT_REPORT") {
+            report(Path::new(&path), &tally, &setups, seed).unwrap();
+        }
         number += 1;
         eprintln!(
             "trial {number} on {}: {} faults so far, {:.0} s",
@@ -746,21 +749,26 @@ fn random_faults_lose_nothing_and_change_no_byte() {
             start.elapsed().as_secs_f64()
         );
     }
-    let table = tally.table(&setups);
-    eprintln!("{table}");
-    if let Some(path) = std::env::var_os("HYDROFLEX_FAULT_REPORT") {
-        let report = format!(
-            "# Faults injected, and what they changed: nothing\n\n\
-             Each job is {RUNS} runs of the built-in boom on three or four worker processes and, on PostgreSQL, two\n\
-             coordinators. After each job every run must be accounted for once in the ledger, every file of the data\n\
-             set must have its SHA-256, no object may be left that nobody owns, and the data set must be byte for\n\
-             byte that of one undisturbed worker on SQLite and a directory; one violation ends the harness.\n\n\
-             Written by\n\n```sh\nHYDROFLEX_FAULTS={budget} HYDROFLEX_FAULT_SEED={seed} HYDROFLEX_FAULT_REPORT=docs/faults.md \\\n  \
-             cargo test --release --workspace --test fault_harness -- --nocapture\n```\n\n{table}\n\
-             A worker or coordinator that is stopped is continued after 0.2 to 6 s; the lease is 3 s. S3 is `moto`\n\
-             behind a proxy that answers 500, does not answer, or cuts connections. The disk is a tmpfs of 48 MB\n\
-             (SQLite and directory, as root). Not injected: clock jumps, cut networks between machines, power cuts.\n"
-        );
-        std::fs::write(path, report).unwrap();
-    }
+    eprintln!("{}", tally.table(&setups));
+}
+
+/// What has been injected so far, for people; written after every trial, so that a long night may be cut
+/// short.
+fn report(path: &Path, tally: &Tally, setups: &[Setup], seed: u64) -> std::io::Result<()> {
+    let text = format!(
+        "# Faults injected, and what they changed: nothing\n\n\
+         Each job is {RUNS} runs of the built-in boom on three or four worker processes and, on PostgreSQL, two\n\
+         coordinators. After each job every run must be accounted for once in the ledger, every file of the data\n\
+         set must have its SHA-256, no object may be left that nobody owns, and the data set must be byte for\n\
+         byte that of one undisturbed worker on SQLite and a directory; one violation ends the harness. Readers\n\
+         look at every listed data set in between, and never meet a half-written file.\n\n\
+         Written by\n\n```sh\nHYDROFLEX_FAULTS={} HYDROFLEX_FAULT_SEED={seed} HYDROFLEX_FAULT_REPORT=$PWD/docs/faults.md \\\n  \
+         cargo test --release --workspace --test fault_harness -- --nocapture\n```\n\n{}\n\
+         A worker or coordinator that is stopped is continued after 0.2 to 6 s; the lease is 3 s. S3 is `moto`\n\
+         behind a proxy that answers 500, does not answer, or cuts connections. The disk is a tmpfs of 48 MB\n\
+         (SQLite and directory, as root). Not injected: clock jumps, cut networks between machines, power cuts.\n",
+        tally.total(),
+        tally.table(setups)
+    );
+    std::fs::write(path, text)
 }
