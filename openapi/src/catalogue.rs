@@ -90,7 +90,7 @@ pub struct MachineInfo {
     pub cylinders: Vec<String>,
     /// Names of its angles.
     pub angles: Vec<String>,
-    /// False if its mesh must be given and the service cannot simulate it.
+    /// False if a job must give its meshes (`POST /v1/meshes`).
     pub available: bool,
     /// The machine file.
     pub toml: String,
@@ -101,4 +101,23 @@ pub struct MachineInfo {
 pub struct MachineList {
     /// Machines.
     pub machines: Vec<MachineInfo>,
+}
+
+/// An uploaded mesh.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MeshInfo {
+    /// SHA-256 of the file, 64 hexadecimal digits: what a job's `meshes` name.
+    pub mesh_sha256: String,
+    /// Size of the file.
+    pub size_bytes: u64,
+    /// Nodes.
+    pub nodes: u64,
+    /// Elements.
+    pub elements: u64,
+    /// `C3D4` or `C3D10`.
+    pub element_kind: String,
+    /// Volume of all elements.
+    pub volume_m3: f64,
+    /// Names of its node sets.
+    pub node_sets: Vec<String>,
 }

@@ -18,6 +18,10 @@ pub struct JobSpec {
     /// Built-in machine by name, or a machine file's text (TOML).
     #[serde(default = "default_machine")]
     pub machine: MachineRef,
+    /// Meshes that were uploaded, by body: `{"lift": "SHA-256 as POST /v1/meshes answered"}`. They go before
+    /// those the machine file names, and are needed where it says that a mesh is given.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub meshes: BTreeMap<String, String>,
     /// Number of runs.
     pub runs: u64,
     /// Seed of every random choice.

@@ -102,6 +102,19 @@ impl Client {
         self.read(request, path)
     }
 
+    /// Posts a file.
+    ///
+    /// # Errors
+    /// If the service cannot be reached, refuses, or answers something else.
+    pub fn post_bytes<T: DeserializeOwned>(&self, path: &str, body: Vec<u8>) -> anyhow::Result<T> {
+        let request = self
+            .http
+            .post(self.url(path))
+            .header("content-type", "application/octet-stream")
+            .body(body);
+        self.read(request, path)
+    }
+
     /// Sends a request and turns problem details into an error.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! Claim, simulate, put, commit; and around it the heartbeat, the limits, the end.
 
-use crate::machines::Machines;
+use crate::machines::{Machines, RefusedMachine};
 use crate::memory;
 use crate::shard::{self, EncodedShard, ShardControl, ShardFailure};
 use anyhow::Context;
@@ -252,10 +252,13 @@ impl Worker {
         let control = Arc::new(ShardControl::default());
         let mut work = tokio::task::spawn_blocking({
             let (claim, control) = (claim.clone(), control.clone());
-            let (machines, pool) = (self.machines.clone(), self.pool.clone());
+            let (machines, pool, blobs) = (self.machines.clone(), self.pool.clone(), self.blobs.clone());
             move || {
-                let machine = match machines.ready(&claim.job.spec) {
+                let machine = match machines.ready(&claim.job.spec, &blobs) {
                     Ok(machine) => machine,
+                    Err(refused @ RefusedMachine::Store { .. }) => {
+                        return Err(Simulated::Lost(refused.to_string()));
+                    }
                     Err(refused) => return Err(Simulated::Impossible(refused.to_string())),
                 };
                 if machine.sha256 != claim.job.machine_sha256 {

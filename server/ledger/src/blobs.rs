@@ -3,6 +3,7 @@
 //! ```text
 //! shards/JOB/…-eEPOCH.parquet   private; created once, never replaced, deleted when the job is over
 //! datasets/ID/…   models/ID/…   addressed by content; visible once the ledger lists them
+//! meshes/SHA256.inp             uploaded, addressed by content
 //! ```
 
 use crate::s3;
@@ -88,6 +89,14 @@ impl BlobError {
     pub fn is_already_there(&self) -> bool {
         matches!(self, Self::Store(object_store::Error::AlreadyExists { .. }))
     }
+}
+
+/// Key of an uploaded mesh; nothing for text that is no SHA-256 in lower case, so that no text from
+/// outside becomes a path.
+#[must_use]
+pub fn mesh_key(sha256: &str) -> Option<String> {
+    let hexadecimal = |byte: u8| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte);
+    (sha256.len() == 64 && sha256.bytes().all(hexadecimal)).then(|| format!("meshes/{sha256}.inp"))
 }
 
 /// A place for objects.

@@ -2,6 +2,7 @@
 
 use crate::client::Client;
 use anyhow::Context;
+use hydroflex_openapi::catalogue::MeshInfo;
 use hydroflex_openapi::status::{JobPage, JobState, JobStatus};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -24,6 +25,9 @@ pub enum Command {
     Submit {
         /// Job as JSON
         file: PathBuf,
+        /// BODY=FILE: upload this Abaqus mesh and give it to the job's machine; may be repeated
+        #[arg(long, value_parser = mesh_of_body)]
+        mesh: Vec<(String, PathBuf)>,
         /// Wait until the data set is published and the networks are trained
         #[arg(long)]
         wait: bool,
@@ -80,7 +84,12 @@ pub enum Command {
 /// If the service cannot be reached or refuses, and, for `--wait` and `watch`, if the job does not succeed.
 pub fn run(command: Command) -> anyhow::Result<()> {
     match command {
-        Command::Submit { file, wait, service } => submit(&file, wait, &service),
+        Command::Submit {
+            file,
+            mesh,
+            wait,
+            service,
+        } => submit(&file, &mesh, wait, &service),
         Command::List { service } => list(&service),
         Command::Show { job, service } => {
             let status: JobStatus = Client::new(&service.url)?.get(&format!("/v1/jobs/{job}"))?;
@@ -103,7 +112,39 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     }
 }
 
-fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> {
+fn mesh_of_body(argument: &str) -> Result<(String, PathBuf), String> {
+    match argument.split_once('=') {
+        Some((body, file)) if !body.is_empty() && !file.is_empty() => Ok((body.to_owned(), file.into())),
+        _ => Err("expected BODY=FILE, for example lift=boom.inp".to_owned()),
+    }
+}
+
+/// The job with the hashes of meshes that are uploaded for it.
+fn with_meshes(client: &Client, text: &str, meshes: &[(String, PathBuf)]) -> anyhow::Result<String> {
+    let mut job: serde_json::Value = serde_json::from_str(text).context("the job is not JSON")?;
+    let fields = job.as_object_mut().context("the job is not a JSON object")?;
+    let given = fields
+        .entry("meshes")
+        .or_insert_with(|| serde_json::json!({}))
+        .as_object_mut()
+        .context("the job's \"meshes\" is not an object")?;
+    for (body, file) in meshes {
+        let content =
+            std::fs::read(file).with_context(|| format!("cannot read the mesh {}", file.display()))?;
+        let info: MeshInfo = client
+            .post_bytes("/v1/meshes", content)
+            .with_context(|| format!("mesh {}", file.display()))?;
+        given.insert(body.clone(), info.mesh_sha256.into());
+    }
+    Ok(job.to_string())
+}
+
+fn submit(
+    file: &Path,
+    meshes: &[(String, PathBuf)],
+    wait: bool,
+    service: &ServiceArgs,
+) -> anyhow::Result<()> {
     let mut text = String::new();
     if file == Path::new("-") {
         std::io::stdin()
@@ -114,6 +155,9 @@ fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> 
             .with_context(|| format!("cannot read the job {}", file.display()))?;
     }
     let client = Client::new(&service.url)?;
+    if !meshes.is_empty() {
+        text = with_meshes(&client, &text, meshes)?;
+    }
     let status: JobStatus = client.post_text("/v1/jobs", text)?;
     if wait {
         return watch(&client, &status.job_id.to_string(), service.json);

@@ -4,14 +4,17 @@ use super::worker::default_cache;
 use crate::coordinator::machines::CheckedMachine;
 use anyhow::{Context, bail, ensure};
 use hydroflex_dataset::{DirectorySink, Published, Publisher, RunKind, RunRecord};
+use hydroflex_ledger::blobs::{Blobs, mesh_key};
 use hydroflex_openapi::dataset::{DATASET_FORMAT, DatasetSource, Manifest, ManifestFile};
 use hydroflex_openapi::job::JobSpec;
-use hydroflex_worker::machines::Machines;
+use hydroflex_worker::machines::{Machines, ReadyMachine, RefusedMachine};
 use hydroflex_worker::shard::{self, ShardFailure};
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
+use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Arguments of `hydroflex reproduce`.
 #[derive(Debug, clap::Args)]
@@ -27,6 +30,9 @@ pub struct Args {
     /// Directory for reduced bodies (default: a folder of the user's cache directory)
     #[arg(long)]
     pub cache: Option<PathBuf>,
+    /// Mesh file that was uploaded for the machine; may be repeated, and is known by its content
+    #[arg(long)]
+    pub mesh: Vec<PathBuf>,
     /// Print a machine-readable summary
     #[arg(long)]
     pub json: bool,
@@ -60,6 +66,35 @@ pub(super) fn read_manifest(path: &Path) -> anyhow::Result<Manifest> {
         format.map_or_else(|| "none".to_owned(), |format| format.to_string())
     );
     serde_json::from_value(value).with_context(|| format!("{} is not a manifest", path.display()))
+}
+
+/// The machine of a job, with the meshes that were uploaded for it.
+///
+/// # Errors
+/// If a mesh cannot be read or is missing, or this build refuses the machine.
+pub(super) fn ready_machine(
+    spec: &JobSpec,
+    cache: Option<PathBuf>,
+    meshes: &[PathBuf],
+) -> anyhow::Result<Arc<ReadyMachine>> {
+    let runtime = tokio::runtime::Runtime::new()?;
+    let folder = tempfile::tempdir().context("cannot make a temporary directory")?;
+    let blobs = Blobs::directory(folder.path())?;
+    for mesh in meshes {
+        let content =
+            std::fs::read(mesh).with_context(|| format!("cannot read --mesh {}", mesh.display()))?;
+        let key = mesh_key(&hex::encode(Sha256::digest(&content))).context("a hash is a key")?;
+        runtime.block_on(blobs.create(&key, content.into()))?;
+    }
+    let _entered = runtime.enter();
+    Machines::new(cache.unwrap_or_else(default_cache))
+        .ready(spec, &blobs)
+        .map_err(|refused| match refused {
+            RefusedMachine::NoMesh { body, sha256 } => anyhow::anyhow!(
+                "body {body:?} needs the mesh with SHA-256 {sha256}, that was uploaded for the job; give it with --mesh FILE"
+            ),
+            other => other.into(),
+        })
 }
 
 /// Runs the command.
@@ -127,7 +162,7 @@ fn make(args: &Args, expected: &Manifest, out: &Path) -> anyhow::Result<Publishe
             env!("CARGO_PKG_VERSION")
         );
     }
-    let machine = Machines::new(args.cache.clone().unwrap_or_else(default_cache)).ready(spec)?;
+    let machine = ready_machine(spec, args.cache.clone(), &args.mesh)?;
     ensure!(
         machine.sha256 == expected.machine.content_sha256,
         "this build's machine has SHA-256 {}, the data set was made with {}",

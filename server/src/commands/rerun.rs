@@ -1,14 +1,13 @@
 //! `hydroflex rerun`: one run of a job again, here and now, for a look at it.
 
 use super::job::ServiceArgs;
-use super::worker::default_cache;
 use crate::client::Client;
 use anyhow::{Context, ensure};
 use hydroflex_dataset::{RunKind, RunOutcome, RunRecord};
 use hydroflex_openapi::dataset::{DatasetSource, Manifest};
 use hydroflex_openapi::job::JobSpec;
 use hydroflex_openapi::status::JobStatus;
-use hydroflex_worker::machines::{Machines, ReadyMachine};
+use hydroflex_worker::machines::ReadyMachine;
 use hydroflex_worker::run;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -28,6 +27,9 @@ pub struct Args {
     /// Write the samples to this file (CSV)
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// Mesh file that was uploaded for the machine; may be repeated, and is known by its content
+    #[arg(long)]
+    pub mesh: Vec<PathBuf>,
     /// Directory for reduced bodies (default: a folder of the user's cache directory)
     #[arg(long)]
     pub cache: Option<PathBuf>,
@@ -60,7 +62,7 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         args.run,
         runs.saturating_sub(1)
     );
-    let machine = Machines::new(args.cache.clone().unwrap_or_else(default_cache)).ready(spec)?;
+    let machine = super::reproduce::ready_machine(spec, args.cache.clone(), &args.mesh)?;
     ensure!(
         machine.sha256 == source.machine_sha256,
         "this build's machine has SHA-256 {}, the job was made with {}: its runs would be others",

@@ -69,7 +69,7 @@ impl Coordinator {
     /// A coordinator on a ledger and a store. Nothing happens before [`Coordinator::run`].
     #[must_use]
     pub fn new(ledger: Ledger, blobs: Blobs, config: CoordinatorConfig) -> Self {
-        let machines = MachineDesk::new(config.cache.clone());
+        let machines = MachineDesk::new(config.cache.clone(), blobs.clone());
         let publishing = Mutex::default();
         Self(Arc::new(Inner {
             ledger,

@@ -13,6 +13,7 @@ pub mod archive;
 pub mod trainings;
 pub mod models;
 pub mod machines;
+pub mod meshes;
 pub mod operations;
 
 use crate::coordinator::Coordinator;
@@ -27,7 +28,7 @@ use hydroflex_ledger::blobs::Blobs;
 use std::sync::Arc;
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::OpenApi;
-use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
 use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
 
@@ -125,6 +126,7 @@ fn routes() -> OpenApiRouter<AppState> {
         .routes(routes!(models::predict))
         .routes(routes!(machines::list))
         .routes(routes!(machines::show))
+        .routes(routes!(meshes::upload).layer(DefaultBodyLimit::max(meshes::MESH_LIMIT_BYTES)))
         .routes(routes!(operations::live))
         .routes(routes!(operations::ready))
         .routes(routes!(operations::metrics))
