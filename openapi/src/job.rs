@@ -60,6 +60,15 @@ pub struct JobSpec {
     /// Networks to train when the data set is published.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub train: Vec<TrainingSpec>,
+    /// Jobs of higher priority go first, −100 to 100; of equal ones the older. No part of the data set.
+    #[serde(default, skip_serializing_if = "is_default_priority")]
+    #[schema(minimum = -100, maximum = 100)]
+    pub priority: i32,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_default_priority(priority: &i32) -> bool {
+    *priority == 0
 }
 
 fn default_machine() -> MachineRef {
@@ -79,6 +88,9 @@ fn default_settling_runs() -> u64 {
 }
 
 impl JobSpec {
+    /// Priorities that a job may have.
+    pub const PRIORITIES: std::ops::RangeInclusive<i32> = -100..=100;
+
     /// Steps of a run: its length in sample times, rounded. A run has one sample more.
     #[must_use]
     #[expect(

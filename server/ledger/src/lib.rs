@@ -6,7 +6,8 @@
 //! - `transition`: the life of a shard as a pure function
 //! - `engine`: SQLite and PostgreSQL behind one small surface
 //! - `jobs`, `shards`, `workers`, `artefacts`, `aliases`, `events`: what can be done, one transaction each
-//! - `blobs`: objects in a directory or an object store
+//! - `keys`: who may use the REST interface
+//! - `blobs`: objects in a directory, or in S3 (`s3`) over TLS (`tls`)
 //! - `crash`: places where tests let a process die
 //!
 //! Deliberately absent: a queue. Workers claim straight from the table of shards. Also absent: any
@@ -22,7 +23,10 @@ mod workers;
 mod artefacts;
 mod aliases;
 mod events;
+pub mod keys;
 pub mod blobs;
+mod s3;
+pub mod tls;
 pub mod crash;
 pub mod identity;
 pub mod clock;
@@ -39,9 +43,10 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 2] = [
+const SCHEMA: [&str; 3] = [
     include_str!("../migrations/0001_ledger.sql"),
     include_str!("../migrations/0002_aliases.sql"),
+    include_str!("../migrations/0003_keys.sql"),
 ];
 
 /// The shared record of what is to be done and what is done.

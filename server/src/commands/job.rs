@@ -57,6 +57,17 @@ pub enum Command {
         #[command(flatten)]
         service: ServiceArgs,
     },
+    /// Do again what failed of a job that is over: given-up runs, or failed trainings
+    Retry {
+        /// Job id
+        job: String,
+        /// Wait until it is over
+        #[arg(long)]
+        wait: bool,
+        /// Service
+        #[command(flatten)]
+        service: ServiceArgs,
+    },
     /// Cancel a job
     Cancel {
         /// Job id
@@ -85,6 +96,14 @@ pub fn run(command: Command) -> anyhow::Result<()> {
             print(&status, service.json)
         }
         Command::Watch { job, service } => watch(&Client::new(&service.url)?, &job, service.json),
+        Command::Retry { job, wait, service } => {
+            let client = Client::new(&service.url)?;
+            let status: JobStatus = client.post(&format!("/v1/jobs/{job}/retry"), &serde_json::json!({}))?;
+            if wait {
+                return watch(&client, &job, service.json);
+            }
+            print(&status, service.json)
+        }
         Command::Cancel { job, service } => {
             let client = Client::new(&service.url)?;
             let status: JobStatus = client.post(&format!("/v1/jobs/{job}/cancel"), &serde_json::json!({}))?;
@@ -206,6 +225,19 @@ fn print(status: &JobStatus, json: bool) -> anyhow::Result<()> {
         "runs     {} of {} done, {} failed",
         progress.runs_done, progress.runs_total, progress.runs_failed
     ))?;
+    let spent = &progress.spent;
+    let done = progress.runs_done + progress.settling_done;
+    if done > 0 {
+        let per_run_ms = |seconds: f64| 1e3 * seconds / done as f64;
+        super::print_line(format_args!(
+            "workers  {:.3} ms per run: {:.3} simulate, {:.3} encode, {:.3} put; {:.3} waiting beside",
+            per_run_ms(spent.simulate_s + spent.encode_s + spent.put_s),
+            per_run_ms(spent.simulate_s),
+            per_run_ms(spent.encode_s),
+            per_run_ms(spent.put_s),
+            per_run_ms(spent.wait_s)
+        ))?;
+    }
     if let (Some(id), Some(sha256)) = (&status.dataset_id, &status.dataset_sha256) {
         super::print_line(format_args!("data set {id} (SHA-256 {sha256})"))?;
     }

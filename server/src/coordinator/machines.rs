@@ -79,6 +79,12 @@ const REACH_DRAWS: u64 = 100;
 const REACH_LEAST: f64 = 0.05;
 
 impl CheckedMachine {
+    /// A machine that a worker would simulate.
+    #[must_use]
+    pub fn new(ready: Arc<ReadyMachine>) -> Self {
+        Self(ready)
+    }
+
     /// SHA-256 of the machine, hexadecimal.
     #[must_use]
     pub fn sha256(&self) -> &str {
@@ -97,7 +103,20 @@ impl CheckedMachine {
     /// The fields at fault.
     pub fn validate(&self, spec: &JobSpec) -> Result<(), Vec<FieldError>> {
         let file = self.0.machine().file();
-        scenario::validate(spec, file)?;
+        let mut errors = match scenario::validate(spec, file) {
+            Ok(()) => Vec::new(),
+            Err(errors) => errors,
+        };
+        if !JobSpec::PRIORITIES.contains(&spec.priority) {
+            errors.push(
+                FieldError::new("/priority", "not a priority")
+                    .value(spec.priority)
+                    .allowed("-100 to 100"),
+            );
+        }
+        if !errors.is_empty() {
+            return Err(errors);
+        }
         let part = scenario::reachable_part(spec, file, &self.0.simulator, REACH_DRAWS);
         if part < REACH_LEAST {
             return Err(vec![FieldError::new(
@@ -117,6 +136,8 @@ impl CheckedMachine {
     /// What decides the bytes of a job's data set, beside its runs.
     #[must_use]
     pub fn publish_spec(&self, spec: JobSpec) -> PublishSpec {
+        // When a job's turn comes changes no byte of what it makes.
+        let spec = JobSpec { priority: 0, ..spec };
         let file = self.0.machine().file();
         let machine = MachineFacts {
             name: file.name.clone(),

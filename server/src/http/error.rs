@@ -10,6 +10,10 @@ use hydroflex_openapi::problem::{FieldError, PROBLEM_MEDIA_TYPE, Problem};
 /// Why a request was not fulfilled.
 #[derive(Debug)]
 pub enum ApiError {
+    /// No key, or one that is not valid.
+    Unauthorized(String),
+    /// The key is valid, and not for this.
+    Forbidden(String),
     /// Nothing is at that address.
     NotFound(String),
     /// The address exists, the method does not.
@@ -57,6 +61,20 @@ impl ApiError {
 
     fn parts(self) -> (StatusCode, &'static str, &'static str, String, Vec<FieldError>) {
         match self {
+            Self::Unauthorized(detail) => (
+                StatusCode::UNAUTHORIZED,
+                "unauthorized",
+                "Unauthorized",
+                detail,
+                Vec::new(),
+            ),
+            Self::Forbidden(detail) => (
+                StatusCode::FORBIDDEN,
+                "forbidden",
+                "Forbidden",
+                detail,
+                Vec::new(),
+            ),
             Self::NotFound(detail) => (
                 StatusCode::NOT_FOUND,
                 "not-found",
@@ -197,6 +215,9 @@ impl IntoResponse for ApiError {
         }
         if status == StatusCode::UPGRADE_REQUIRED {
             headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+        }
+        if status == StatusCode::UNAUTHORIZED {
+            headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
         }
         if let Some(size) = size
             && let Ok(value) = HeaderValue::from_str(&format!("bytes */{size}"))

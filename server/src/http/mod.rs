@@ -3,6 +3,7 @@
 //! Deliberately absent: any request field that names a path or a URL which the service would read.
 
 pub mod error;
+pub mod auth;
 pub mod extract;
 pub mod jobs;
 pub mod events;
@@ -54,6 +55,7 @@ pub struct AppState {
     coordinator: Coordinator,
     models: Arc<ModelRegistry>,
     gate: Arc<Gate>,
+    door: Arc<auth::Door>,
 }
 
 impl AppState {
@@ -64,7 +66,21 @@ impl AppState {
             coordinator,
             models: Arc::default(),
             gate: Arc::default(),
+            door: Arc::new(auth::Door::new(false)),
         }
+    }
+
+    /// The same, asking for API keys.
+    #[must_use]
+    pub fn behind_keys(mut self) -> Self {
+        self.door = Arc::new(auth::Door::new(true));
+        self
+    }
+
+    /// Who may come in.
+    #[must_use]
+    pub fn door(&self) -> &auth::Door {
+        &self.door
     }
 
     /// The coordinator.
@@ -130,6 +146,7 @@ fn routes() -> OpenApiRouter<AppState> {
         .routes(routes!(jobs::submit, jobs::list))
         .routes(routes!(jobs::show))
         .routes(routes!(jobs::cancel))
+        .routes(routes!(jobs::retry))
         .routes(routes!(events::follow))
         .routes(routes!(datasets::list))
         .routes(routes!(datasets::show))
@@ -212,7 +229,7 @@ pub fn router(state: AppState) -> Router {
     let (router, _) = routes().split_for_parts();
     router
         .merge(file_routes())
-        .with_state(state)
+        .with_state(state.clone())
         .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi()))
         .route(
             "/",
@@ -221,6 +238,7 @@ pub fn router(state: AppState) -> Router {
         .fallback(unknown_path)
         .method_not_allowed_fallback(unknown_method)
         .layer(DefaultBodyLimit::max(extract::BODY_LIMIT_BYTES))
+        .layer(axum::middleware::from_fn_with_state(state, auth::guard))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(axum::middleware::from_fn(operations::measure))
 }

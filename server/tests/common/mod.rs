@@ -32,6 +32,11 @@ pub(crate) struct Answer {
 
 impl Desk {
     pub(crate) async fn new() -> Self {
+        Self::with(1000, false).await
+    }
+
+    /// A desk that looks after at most so many jobs, or asks for keys.
+    pub(crate) async fn with(most_jobs: u64, keys: bool) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let url = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
         let ledger = Ledger::create(&url).await.unwrap();
@@ -42,9 +47,14 @@ impl Desk {
             cache: std::env::temp_dir().join("hydroflex-test-cache"),
             workers: 2,
             lease: Duration::from_secs(10),
+            most_jobs,
         };
         let coordinator = Coordinator::new(ledger.clone(), blobs.clone(), config);
-        let router = hydroflex_server::app(AppState::new(coordinator));
+        let mut state = AppState::new(coordinator);
+        if keys {
+            state = state.behind_keys();
+        }
+        let router = hydroflex_server::app(state);
         Self {
             ledger,
             blobs,
