@@ -30,13 +30,13 @@ CASES = [
 # The crane: (runs, scheme, solution, tolerance, tolerance of what 5 ms does not resolve). Its reference starts from a static solution
 # of tolerance 1e-4: with 0 and 50 kg its first sample is up to 1.4e-4 of range off in p1, and turns with 0.1 rad/s². Exudyn itself,
 # driven to a static tolerance of 1e-10 (sim/validation/exudyn_crane.py), differs from the reference by as much and from us by less
-# than 4e-6 in every channel, whatever the payload. The runs with 100 kg start well, and show that in the reference too.
+# than 4e-6 in a and 6e-5 in b, whatever the payload. Runs 9 and 12 (100 kg) start well, and show it in the reference too.
 # b, run 9: the reference accepted one unconverged step (340: it misses the pressure law there by 2e5 Pa, elsewhere by 0.01 Pa).
 # c, runs 6 and 7 (50 kg): the start again, 1.1e-3 in the first sample's deflection; Exudyn with 0.25 ms has the same 1.0e-3.
 CRANE = [
-    ("8,9,12", "trapezoidal-index-2", "a", "1e-5", "1e-3"),
+    ("9,12", "trapezoidal-index-2", "a", "1e-5", "1e-3"),
     ("0,1,2,3,4,5,6,7,8,9,10,11,12,13,14", "trapezoidal-index-2", "a", "3e-4", "1e-3"),
-    ("8,12", "generalized-alpha", "b", "1e-5", "1e-3"),
+    ("12", "generalized-alpha", "b", "1e-5", "1e-3"),
     ("0,1,2,3,4,5,6,7,8,10,11,12,13,14", "generalized-alpha", "b", "7e-3", "2e-2"),
     ("0,1,2,3,4,5,8,9,10,11,12,13,14", "accurate", "c", "1e-3", "1e-3"),
     ("6,7", "accurate", "c", "1.2e-3", "2.5e-3"),

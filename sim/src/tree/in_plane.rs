@@ -13,7 +13,7 @@ use crate::reduction::{ReducedBody, ReducedInterface, ReducedNode};
 const COUPLING_LEAST: f64 = 1e-2;
 
 /// How far a body may be from symmetric about the plane: coupling of motions across it with motions in it, relative to
-/// full coupling. On the published meshes it is 1e-3 to 1e-1, and strains at their sides miss up to 2 % without it.
+/// full coupling. On the published meshes it is up to 0.9, and strains at their sides miss up to 2 % without it.
 const ASYMMETRY_MOST: f64 = 1e-6;
 
 /// The body with the modes that move in the plane, or the coupling that makes it more than a plane's.
