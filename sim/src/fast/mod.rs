@@ -161,10 +161,11 @@ impl PlanarModel {
                 return;
             }
         };
+        let order = self.order(modes, common.tolerance);
         // The sizes that the loop is compiled for; padding modes are zero.
         macro_rules! sizes {
-            ($(($modes:literal, $coupled:literal)),*) => {
-                $(if let Some(c) = self.constants::<$modes, $coupled>(modes) {
+            ($(($coupled:literal, $plain:literal, $followers:literal)),*) => {
+                $(if let Some(c) = self.constants::<$coupled, $plain, $followers>(modes, &order) {
                     match layout {
                         Layout::OneByOne => dispatch::one_by_one(set, &c, common, inputs, &fit, results),
                         Layout::SideBySide => dispatch::side_by_side(set, &c, common, inputs, &fit, results),
@@ -173,7 +174,7 @@ impl PlanarModel {
                 })*
             };
         }
-        sizes!((8, 4), (16, 8), (32, 32));
+        sizes!((4, 4, 4), (8, 8, 8), (32, 32, 32));
     }
 
     fn check(&self, input: &RunInput) -> Result<(), RunFailure> {
