@@ -90,6 +90,7 @@ pub(super) struct Constants<const A: usize, const B: usize, const Q: usize> {
 
 /// Typical ranges against which the local error is measured.
 #[derive(Debug, Clone, Copy)]
+#[allow(clippy::struct_field_names, reason = "each is a reciprocal of a unit")]
 pub(super) struct Scale {
     /// Reciprocal pressure range, 1/Pa.
     pub(super) per_pa: f64,

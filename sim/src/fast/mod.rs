@@ -5,6 +5,10 @@
     clippy::inline_always,
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
+#![allow(
+    clippy::needless_range_loop,
+    reason = "a loop over modes or chambers reads several arrays at once"
+)]
 #![doc = include_str!("../../theory/minimal_coordinates.md")]
 
 mod constants;
