@@ -5,10 +5,12 @@
 //! overlap in memory, so sliding over a recording copies nothing either.
 
 pub mod kernel;
+pub mod sliding;
+pub mod synthetic;
 
-use crate::model::weights::{Auxiliary, Weights};
+use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
-use hydroflex_openapi::model::{IntervalTable, ModelConfig};
+use hydroflex_openapi::model::{Activation, IntervalTable, ModelConfig};
 use kernel::PackedLayer;
 
 /// Rows computed at once; activations of a block stay in the second-level cache.
@@ -19,6 +21,8 @@ const BLOCK_ROWS: usize = 48;
 pub struct Predictor {
     steps: usize,
     inputs: Scaling,
+    /// Offset and 1 / scale of every value of one sample row.
+    input_maps: Vec<(f64, f64)>,
     targets: Scaling,
     /// First to last; the first one also holds the skip as a linear tail.
     layers: Vec<PackedLayer>,
@@ -60,16 +64,59 @@ pub struct SeriesEstimates {
     pub inside: Vec<bool>,
 }
 
+/// Layers with nothing between them are one linear map: `W₂ (W₁ x + b₁) + b₂ = (W₂ W₁) x + (W₂ b₁ + b₂)`,
+/// multiplied in f64. Folded where that makes the network smaller.
+fn fold(config: &ModelConfig, weights: &Weights) -> Vec<(Vec<Activation>, LinearWeights)> {
+    let mut folded: Vec<(Vec<Activation>, LinearWeights)> = Vec::with_capacity(config.layers.len());
+    for (layer, map) in config.layers.iter().zip(&weights.layers) {
+        if let Some((activations, before)) = folded.last_mut()
+            && activations.is_empty()
+        {
+            let (inner, outputs) = (before.bias.len(), map.bias.len());
+            let inputs = before.weight.len() / inner;
+            if inputs * outputs <= inputs * inner + inner * outputs {
+                *before = compose(before, map, inputs);
+                activations.clone_from(&layer.activations);
+                continue;
+            }
+        }
+        folded.push((layer.activations.clone(), map.clone()));
+    }
+    folded
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+fn compose(first: &LinearWeights, second: &LinearWeights, inputs: usize) -> LinearWeights {
+    let inner = first.bias.len();
+    let mut weight = Vec::with_capacity(second.bias.len() * inputs);
+    let mut bias = Vec::with_capacity(second.bias.len());
+    for (row, &offset) in second.weight.chunks_exact(inner).zip(&second.bias) {
+        let mut sums = vec![0.0_f64; inputs];
+        let mut constant = f64::from(offset);
+        for ((&factor, from), &b) in row.iter().zip(first.weight.chunks_exact(inputs)).zip(&first.bias) {
+            let factor = f64::from(factor);
+            constant += factor * f64::from(b);
+            for (sum, &w) in sums.iter_mut().zip(from) {
+                *sum += factor * f64::from(w);
+            }
+        }
+        weight.extend(sums.into_iter().map(|sum| sum as f32));
+        bias.push(constant as f32);
+    }
+    LinearWeights { weight, bias }
+}
+
 impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let empty = crate::model::weights::LinearWeights::default();
+        let empty = LinearWeights::default();
         let skip = weights.skip.as_ref();
         let mut layers = Vec::with_capacity(weights.layers.len().max(1));
-        for (position, (layer, map)) in config.layers.iter().zip(&weights.layers).enumerate() {
+        let folded = fold(config, weights);
+        for (position, (activations, map)) in folded.iter().enumerate() {
             let tail = skip.filter(|_| position == 0).unwrap_or(&empty);
-            layers.push(PackedLayer::with_linear_tail(map, &layer.activations, tail));
+            layers.push(PackedLayer::with_linear_tail(map, activations, tail));
         }
         if layers.is_empty() {
             layers.push(PackedLayer::new(skip.unwrap_or(&empty), &[]));
@@ -88,8 +135,13 @@ impl Predictor {
         Self {
             steps: config.window_steps,
             inputs: Scaling::from_config(&config.inputs),
+            input_maps: config
+                .inputs
+                .iter()
+                .map(|channel| (channel.offset, channel.scale.recip()))
+                .collect(),
             targets: Scaling::from_config(&config.targets),
-            first_width: config.layers.first().map_or(0, |layer| layer.outputs),
+            first_width: folded.first().map_or(0, |(_, map)| map.bias.len()),
             has_skip: skip.is_some(),
             layers,
             intervals: config.intervals.clone(),
@@ -138,7 +190,7 @@ impl Predictor {
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
         Workspace {
-            window: vec![0.0; self.window_len()],
+            window: vec![0.0; BLOCK_ROWS * self.window_len()],
             scaled: vec![0.0; BLOCK_ROWS * self.targets.len()],
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
@@ -159,12 +211,7 @@ impl Predictor {
     /// When a slice has another length.
     pub fn predict_window(&self, window: &[f64], out: &mut [f64], workspace: &mut Workspace) {
         assert_eq!(window.len(), self.window_len(), "values of a window");
-        assert_eq!(out.len(), self.targets.len(), "one estimate per target");
-        let mut scaled = std::mem::take(&mut workspace.window);
-        self.scale_rows(window, &mut scaled);
-        self.block(&scaled, scaled.len(), 1, workspace);
-        workspace.window = scaled;
-        self.unscale(1, out, workspace);
+        self.predict_windows(window, out, workspace);
     }
 
     /// Estimates for windows that stand one after the other, each as in [`Self::predict_window`];
@@ -172,27 +219,79 @@ impl Predictor {
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn predict_windows(&self, windows: &[f64], out: &mut [f64], workspace: &mut Workspace) {
+    pub fn predict_windows<T: Copy + Into<f64>>(
+        &self,
+        windows: &[T],
+        out: &mut [f64],
+        workspace: &mut Workspace,
+    ) {
+        self.predict_windows_with(windows, out, None, workspace);
+    }
+
+    /// As [`Self::predict_windows`], and for each window whether it is inside the envelope, if
+    /// asked for; every window is inside when the model has none.
+    ///
+    /// # Panics
+    /// When a slice has another length.
+    pub fn predict_windows_with<T: Copy + Into<f64>>(
+        &self,
+        windows: &[T],
+        out: &mut [f64],
+        mut inside: Option<&mut [bool]>,
+        workspace: &mut Workspace,
+    ) {
         let size = self.window_len();
+        let targets = self.targets.len();
         assert_eq!(windows.len() % size, 0, "whole windows");
-        assert_eq!(
-            out.len(),
-            windows.len() / size * self.targets.len(),
-            "one row of estimates per window"
+        let count = windows.len() / size;
+        assert_eq!(out.len(), count * targets, "one row of estimates per window");
+        assert!(
+            inside.as_ref().is_none_or(|inside| inside.len() == count),
+            "one flag per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
-        scaled.resize(BLOCK_ROWS * size, 0.0);
-        for (block, estimates) in windows
-            .chunks(BLOCK_ROWS * size)
-            .zip(out.chunks_mut(BLOCK_ROWS * self.targets.len()))
-        {
-            self.scale_rows(block, &mut scaled);
-            let rows = block.len() / size;
+        for (block, samples) in windows.chunks(BLOCK_ROWS * size).enumerate() {
+            let rows = samples.len() / size;
+            let first = block * BLOCK_ROWS;
+            self.scale_rows(samples, &mut scaled);
             self.block(&scaled, size, rows, workspace);
-            self.unscale(rows, estimates, workspace);
+            self.unscale(
+                rows,
+                &mut out[first * targets..(first + rows) * targets],
+                workspace,
+            );
+            if let Some(inside) = inside.as_deref_mut() {
+                let inside = &mut inside[first..first + rows];
+                self.inside_block(&scaled, size, rows, inside, workspace);
+                for (flag, window) in inside.iter_mut().zip(samples.chunks_exact(size)) {
+                    *flag &= self.in_range(window);
+                }
+            }
         }
-        scaled.truncate(size);
         workspace.window = scaled;
+    }
+
+    /// Scaled estimates for windows of scaled values that begin `stride` values apart: the network
+    /// alone. `out` has one row of targets per window.
+    ///
+    /// # Panics
+    /// When a slice has another length.
+    pub fn predict_scaled(
+        &self,
+        scaled: &[f32],
+        stride: usize,
+        rows: usize,
+        out: &mut [f32],
+        workspace: &mut Workspace,
+    ) {
+        let targets = self.targets.len();
+        assert_eq!(out.len(), rows * targets, "one row of estimates per window");
+        for first in (0..rows).step_by(BLOCK_ROWS) {
+            let block = BLOCK_ROWS.min(rows - first);
+            self.block(&scaled[first * stride..], stride, block, workspace);
+            out[first * targets..(first + block) * targets]
+                .copy_from_slice(&workspace.scaled[..block * targets]);
+        }
     }
 
     /// Estimates for a recording, the window sliding by one sample: one column of equal length per
@@ -217,14 +316,19 @@ impl Predictor {
         assert!(columns.iter().all(|c| c.len() == rows), "columns of one length");
         let width = self.inputs.len();
         let mut scaled = vec![0.0_f32; rows * width];
-        for (channel, column) in columns.iter().enumerate() {
-            self.inputs
-                .scale_column(channel, column, &mut scaled[channel..], width);
+        for (channel, (column, (offset, inverse))) in columns.iter().zip(&self.input_maps).enumerate() {
+            let slots = scaled.iter_mut().skip(channel).step_by(width);
+            for (value, slot) in column.iter().zip(slots) {
+                #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+                {
+                    *slot = ((value - offset) * inverse) as f32;
+                }
+            }
         }
         let count = (rows + 1).saturating_sub(self.steps);
         let targets = self.targets.len();
         let mut estimates = vec![Vec::with_capacity(count); targets];
-        let mut inside = Vec::with_capacity(if self.envelope.is_some() { count } else { 0 });
+        let mut inside = vec![true; if self.envelope.is_some() { count } else { 0 }];
         let mut first = 0;
         while first < count {
             let block = BLOCK_ROWS.min(count - first);
@@ -235,7 +339,9 @@ impl Predictor {
                     column.push(self.targets.unscale(t, f64::from(value)));
                 }
             }
-            self.inside_block(x, width, block, &mut inside, workspace);
+            if !inside.is_empty() {
+                self.inside_block(x, width, block, &mut inside[first..first + block], workspace);
+            }
             first += block;
         }
         self.outside_range(columns, &mut inside);
@@ -253,25 +359,6 @@ impl Predictor {
         let distance = (estimate - table.centre).abs();
         let class = table.upper_edges.partition_point(|&edge| edge < distance);
         table.half_widths.get(class).copied()
-    }
-
-    /// Whether one window (as in [`Self::predict_window`]) is inside the envelope; absent when the
-    /// model has none.
-    pub fn window_inside(&self, window: &[f64], workspace: &mut Workspace) -> Option<bool> {
-        let envelope = self.envelope.as_ref()?;
-        let width = self.inputs.len();
-        let in_range = window.chunks(width).all(|row| {
-            row.iter()
-                .zip(&envelope.min)
-                .zip(&envelope.max)
-                .all(|((v, min), max)| v >= min && v <= max)
-        });
-        let mut scaled = std::mem::take(&mut workspace.window);
-        self.scale_rows(window, &mut scaled);
-        let mut inside = Vec::with_capacity(1);
-        self.inside_block(&scaled, scaled.len(), 1, &mut inside, workspace);
-        workspace.window = scaled;
-        Some(in_range && inside == [true])
     }
 
     /// Network output for scaled windows that begin `stride` values apart, one row of scaled
@@ -313,23 +400,44 @@ impl Predictor {
         }
     }
 
+    /// Whether each of the windows is near the training windows; ranges are not looked at.
     fn inside_block(
         &self,
         x: &[f32],
         stride: usize,
         rows: usize,
-        inside: &mut Vec<bool>,
+        inside: &mut [bool],
         workspace: &mut Workspace,
     ) {
-        let Some(envelope) = &self.envelope else { return };
+        let Some(envelope) = &self.envelope else {
+            inside.fill(true);
+            return;
+        };
         envelope
             .projection
             .forward(x, stride, rows, &mut workspace.projected);
         let padded = envelope.projection.padded();
-        for row in workspace.projected[..rows * padded].chunks(padded) {
+        let rows = workspace.projected[..rows * padded].chunks(padded);
+        for (flag, row) in inside.iter_mut().zip(rows) {
             let squares: f32 = row[..envelope.components].iter().map(|v| v * v).sum();
-            inside.push(f64::from(squares) <= envelope.limit * envelope.components as f64);
+            *flag = f64::from(squares) <= envelope.limit * envelope.components as f64;
         }
+    }
+
+    /// Whether every value of these sample rows is in the range of its channel.
+    fn in_range<T: Copy + Into<f64>>(&self, rows: &[T]) -> bool {
+        let Some(envelope) = &self.envelope else {
+            return true;
+        };
+        rows.chunks_exact(self.inputs.len()).all(|row| {
+            row.iter()
+                .zip(&envelope.min)
+                .zip(&envelope.max)
+                .all(|((&value, min), max)| {
+                    let value: f64 = value.into();
+                    value >= *min && value <= *max
+                })
+        })
     }
 
     /// Clears `inside` for every window that holds a value outside its channel's range.
@@ -348,12 +456,13 @@ impl Predictor {
         }
     }
 
+    /// Scaled copies of sample rows.
     #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-    fn scale_rows(&self, rows: &[f64], out: &mut [f32]) {
+    fn scale_rows<T: Copy + Into<f64>>(&self, rows: &[T], out: &mut [f32]) {
         let width = self.inputs.len();
         for (row, slots) in rows.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-            for (channel, (value, slot)) in row.iter().zip(slots).enumerate() {
-                *slot = self.inputs.scale(channel, *value) as f32;
+            for ((&value, slot), (offset, inverse)) in row.iter().zip(slots).zip(&self.input_maps) {
+                *slot = ((value.into() - offset) * inverse) as f32;
             }
         }
     }

@@ -27,7 +27,7 @@ mod solve;
 mod statics;
 mod step;
 mod sums;
-mod tableau;
+pub(crate) mod tableau;
 mod track;
 
 #[cfg(test)]
