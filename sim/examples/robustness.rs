@@ -5,6 +5,8 @@
 //! Configurations and valve signals are those of a job with seed 1. A panic ends the program, a hang shows as the
 //! slowest run; a number that is not finite is counted as such although its run claims success.
 
+#![allow(clippy::print_stdout, reason = "this program's output is its purpose")]
+
 use std::collections::BTreeMap;
 use std::time::Instant;
 

@@ -4,6 +4,8 @@
 //!
 //! Runs: `[{"run_id": 0, "payload_kg": 0, "angles_rad": [..], "valves_ratio": [[..], ..]}, ..]`.
 
+#![allow(clippy::print_stdout, reason = "this program's output is its purpose")]
+
 use std::time::Instant;
 
 use hydroflex_openapi::job::Integrator;

@@ -139,10 +139,10 @@ impl Simulator {
             let tree = TreeModel::new(file, &reduced, with_payload);
             Ok(Variant {
                 reduced,
-                tree,
                 system,
                 recorder,
                 planar,
+                tree,
             })
         });
         match made {

@@ -276,6 +276,7 @@ impl FloatingFrame {
     }
 
     /// Adds `M q̈ − f_v − f_e` to the residual rows: force (global), moment (body frame), modal.
+    #[allow(clippy::needless_range_loop, reason = "many lists share the mode's number")]
     pub fn add_inertia_and_elastic(&self, motion: &BodyMotion, frame: &mut [f64], modal: &mut [f64]) {
         let w = &motion.omega_rad_per_s;
         let wd = &motion.alpha_rad_per_s2;

@@ -189,7 +189,7 @@ impl<'a> Stepper<'a> {
                     self.statistics.steps += 1;
                     pieces_done += 1;
                     // Grow again where the finer grid meets the coarser one.
-                    while pieces_total > 1 && pieces_done % 2 == 0 && pieces_done < pieces_total {
+                    while pieces_total > 1 && pieces_done.is_multiple_of(2) && pieces_done < pieces_total {
                         pieces_total /= 2;
                         pieces_done /= 2;
                     }

@@ -28,8 +28,8 @@ pub(crate) fn add_increment(system: &System, ws: &Workspace, by: Increment, stat
         let theta = Vector4::from_column_slice(&state.q[entry.first_q + 3..entry.first_q + 7]);
         let turn =
             rate_map(&theta).tr_mul(&Vector3::from_column_slice(&delta[3..])) / (4.0 * theta.norm_squared());
-        for i in 0..3 {
-            add(state, entry.first_q + i, delta[i]);
+        for (i, shift) in delta[..3].iter().enumerate() {
+            add(state, entry.first_q + i, *shift);
         }
         for i in 0..4 {
             add(state, entry.first_q + 3 + i, turn[i]);

@@ -88,14 +88,17 @@ impl DenseLu {
         for i in 0..n {
             let x = right[i] / self.values[i * n + i];
             right[i] = x;
-            for j in i + 1..n {
-                right[j] -= self.values[i * n + j] * x;
+            for (r, u) in right[i + 1..]
+                .iter_mut()
+                .zip(&self.values[i * n + i + 1..(i + 1) * n])
+            {
+                *r -= u * x;
             }
         }
         for i in (0..n).rev() {
             let x = right[i];
-            for j in 0..i {
-                right[j] -= self.values[i * n + j] * x;
+            for (r, l) in right[..i].iter_mut().zip(&self.values[i * n..i * n + i]) {
+                *r -= l * x;
             }
         }
         for k in (0..n).rev() {

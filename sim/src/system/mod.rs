@@ -1,5 +1,6 @@
 //! The system of bodies, joints and cylinders: constants, state, evaluation and linear solve.
 
+#[allow(clippy::module_inception, reason = "the system is what this module is about")]
 mod system;
 mod state;
 mod workspace;

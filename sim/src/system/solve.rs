@@ -120,14 +120,13 @@ impl System {
                 ws.lu.values[j * order + place] = *x;
             }
             if row >= self.joint_rows && coefficients.cylinders == CylinderRows::Tangent {
-                let tangent = self.tangent(row - self.joint_rows, coefficients, &ws.cylinders);
+                let tangent = Self::tangent(row - self.joint_rows, coefficients, &ws.cylinders);
                 ws.lu.values[place * order + place] = -1.0 / tangent;
             }
         }
     }
 
     fn tangent(
-        &self,
         cylinder: usize,
         coefficients: Coefficients,
         motions: &[super::workspace::CylinderMotion],
@@ -145,7 +144,7 @@ impl System {
     ) -> bool {
         row < self.joint_rows
             || coefficients.cylinders == CylinderRows::Locked
-            || self.tangent(row - self.joint_rows, coefficients, motions) != 0.0
+            || Self::tangent(row - self.joint_rows, coefficients, motions) != 0.0
     }
 
     /// Solves with the last factors for the residuals of the last evaluation: `J δ = −r`, where the

@@ -26,6 +26,7 @@ pub fn channels(file: &MachineFile) -> Vec<Channel> {
 }
 
 /// Channels with what they read.
+#[allow(clippy::too_many_lines, reason = "a list")]
 pub(crate) fn plan(file: &MachineFile) -> Vec<(Channel, Source)> {
     let mut plan = Vec::new();
     let mut add = |name: String, unit: &str, quantity: &str, frame: Option<String>, role, source| {

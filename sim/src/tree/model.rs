@@ -203,6 +203,7 @@ impl TreeModel {
         Self::from_system(system, recorder, file)
     }
 
+    #[allow(clippy::too_many_lines, reason = "one pass from joints to coordinates")]
     fn from_system(system: System, recorder: Recorder, file: &MachineFile) -> Result<Self, NotTree> {
         let markers: Vec<PlanarMarker> = system.markers.iter().map(planar_marker).collect();
         let count = system.bodies.len();

@@ -336,7 +336,7 @@ impl TreeModel {
             for axis in 0..2 {
                 let direction = Vector2::ith(axis, 1.0);
                 let row = &mut rows[(2 * k + axis) * all..][..all];
-                self.start_row(row, m);
+                Self::start_row(row, m);
                 self.push(to, &direction, row, m);
                 self.push(from, &-direction, row, m);
                 self.gather(row, m);
@@ -352,7 +352,7 @@ impl TreeModel {
         m.loop_lu.factorise()
     }
 
-    fn start_row(&self, row: &mut [f64], m: &mut Motion) {
+    fn start_row(row: &mut [f64], m: &mut Motion) {
         row.fill(0.0);
         m.wrenches.fill(Wrench::default());
     }
@@ -426,7 +426,7 @@ impl TreeModel {
     pub(super) fn line_row(&self, cylinder: usize, row: &mut [f64], m: &mut Motion) {
         let [base, rod] = self.cylinders[cylinder];
         let direction = m.lines[cylinder].direction;
-        self.start_row(row, m);
+        Self::start_row(row, m);
         self.push(rod, &direction, row, m);
         self.push(base, &-direction, row, m);
         self.gather(row, m);
@@ -437,7 +437,7 @@ impl TreeModel {
     /// at the last evaluated motion: in the first entries of `m.residual`.
     pub(super) fn residual(&self, forces_n: impl Fn(usize) -> f64, m: &mut Motion) {
         let mut row = std::mem::take(&mut m.residual);
-        self.start_row(&mut row, m);
+        Self::start_row(&mut row, m);
         for k in 0..self.bodies.len() {
             self.add_body(k, &mut row, m);
         }
@@ -517,7 +517,7 @@ impl TreeModel {
         out.fill(0.0);
         for body in 0..self.bodies.len() {
             for (axis, row) in rows.iter_mut().enumerate() {
-                self.start_row(row, m);
+                Self::start_row(row, m);
                 match axis {
                     2 => m.wrenches[body].moment = 1.0,
                     _ => m.wrenches[body].force = Vector2::ith(axis, 1.0),
@@ -560,7 +560,7 @@ impl TreeModel {
         if let Some(at) = self.payload {
             for axis in 0..2 {
                 let row = &mut rows[axis];
-                self.start_row(row, m);
+                Self::start_row(row, m);
                 self.push(at, &Vector2::ith(axis, 1.0), row, m);
                 self.gather(row, m);
                 self.condense(row, m);

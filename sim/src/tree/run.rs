@@ -169,16 +169,14 @@ impl Run<'_> {
             };
             let finite = self.stepper.next.values.iter().all(|x| x.is_finite());
             let ideal = 0.9 / error2.max(1e-12).sqrt().sqrt().sqrt();
-            let shorter = if !(finite && error2 <= 1.0) {
-                Some(
-                    h * if finite && error2.is_finite() {
-                        ideal.clamp(0.1, 0.7)
-                    } else {
-                        0.2
-                    },
-                )
-            } else {
+            // A NaN is a rejection.
+            let passed = finite && error2 <= 1.0;
+            let shorter = if passed {
                 self.switch(h).map(|part| (h * part).max(SWITCH_S).min(h))
+            } else if finite && error2.is_finite() {
+                Some(h * ideal.clamp(0.1, 0.7))
+            } else {
+                Some(0.2 * h)
             };
             if let Some(shorter) = shorter {
                 self.statistics.rejected += 1;
