@@ -212,17 +212,18 @@ def table(a, median, steps, errors, instruction_set, name):
         ("Exudyn at its best, median error within 1e-3 (time integration)", "to 1e-3"),
         ("hydroflex `trapezoidal-index-2`, 5 ms", "trapezoidal"),
         ("hydroflex `generalized-alpha`, 5 ms", "generalized_alpha"),
-        ("hydroflex `accurate`, largest error within 1e-3, alone", "alone"),
-        ("hydroflex `accurate`, in a batch, per run and core", "batch"),
+        ("hydroflex `accurate` (tolerance 1e-3), alone", "alone"),
+        ("hydroflex `accurate` (tolerance 1e-3), in a batch, per run and core", "batch"),
     ]
     milliseconds = lambda row, p: f"{median[row, p] * 1e3:.3g}"
     lines = [
         "# What a simulated second costs",
         "",
-        f"Written by `python sim/validation/benchmark_exudyn.py --rounds {a.rounds} --runs {a.runs} --seed {a.seed}` on "
+        f"Written by `python sim/validation/benchmark_exudyn.py --rounds {a.rounds} --runs {a.runs} --seed {a.seed} --fine-s {a.fine_s:g}` on "
         f"{date.today().isoformat()}: {processor()}, {os.cpu_count()} cores, {platform.system()}, "
         f"{instruction_set} instructions in the batch; Exudyn {exu.__version__}, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}.",
+        f"NumPy {np.__version__}. Load average at the end {os.getloadavg()[0]:.0f}: above the number of cores, other programs "
+        "slowed both by up to twice; compare the ratios.",
         "",
         f"Machine: `sim/validation/lift-boom/boom.toml` (`{name}`), random valve signals of 1 s, samples every 5 ms, "
         "one thread. Milliseconds of user CPU per run, medians, hydroflex and Exudyn in turns. Reducing the body "
