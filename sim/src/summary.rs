@@ -1,10 +1,10 @@
 //! What there is to know about a machine before it moves: for `hydroflex machine show`.
 
 use crate::fe::{assemble_mass, assemble_stiffness};
+use crate::linearise::Actuation;
 use crate::machine::FlexibleBody;
 use crate::reduction::{ReducedBody, ReductionError, clamped_hz, free_free_hz};
 use crate::simulator::{Simulator, SimulatorError};
-use crate::linearise::Actuation;
 use hydroflex_openapi::machine::{
     BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, MachineFile, PayloadSpec,
 };
@@ -308,7 +308,11 @@ const DECAYED: f64 = 0.01;
 
 fn small_motions(simulator: &Simulator, payload_kg: f64) -> SmallMotionsRow {
     let file = simulator.machine().file();
-    let angles_deg: Vec<f64> = file.angles.iter().map(|a| 0.5 * (a.range_deg[0] + a.range_deg[1])).collect();
+    let angles_deg: Vec<f64> = file
+        .angles
+        .iter()
+        .map(|a| 0.5 * (a.range_deg[0] + a.range_deg[1]))
+        .collect();
     let angles_rad: Vec<f64> = angles_deg.iter().map(|a| a.to_radians()).collect();
     let shut = Actuation::Oil {
         valves_ratio: vec![0.0; file.cylinders.len()],
@@ -324,7 +328,11 @@ fn small_motions(simulator: &Simulator, payload_kg: f64) -> SmallMotionsRow {
     match simulator.linearise(payload_kg, &angles_rad, &shut) {
         Ok(found) => {
             // One of every pair.
-            let slowest = found.eigenvalues_per_s.iter().filter(|s| s.im >= 0.0).take(SMALL_MOTIONS_COUNT);
+            let slowest = found
+                .eigenvalues_per_s
+                .iter()
+                .filter(|s| s.im >= 0.0)
+                .take(SMALL_MOTIONS_COUNT);
             for s in slowest {
                 row.decay_per_s.push(-s.re);
                 row.frequency_hz.push(s.im / std::f64::consts::TAU);

@@ -1,9 +1,9 @@
 //! `hydroflex machine`: inspect machine files.
 
 use anyhow::Context;
-use hydroflex_sim::machine::Machine;
 use hydroflex_dataset::window::{band_steps, closing_step, paper_steps};
 use hydroflex_openapi::job::{Integrator, JobSpec};
+use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_settling_run;
 use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::summary::{BodySummary, MachineSummary, payloads_kg, summarise};
@@ -86,7 +86,12 @@ fn windows(simulator: &Simulator) -> anyhow::Result<Vec<WindowRow>> {
     let is = |quantity: &'static str| {
         move |(_, c): &(usize, &hydroflex_openapi::channel::Channel)| c.quantity == quantity
     };
-    let valves: Vec<usize> = channels.iter().enumerate().filter(is("valve opening")).map(|c| c.0).collect();
+    let valves: Vec<usize> = channels
+        .iter()
+        .enumerate()
+        .filter(is("valve opening"))
+        .map(|c| c.0)
+        .collect();
     let mut rows = Vec::new();
     for payload_kg in payloads_kg(file) {
         let spec: JobSpec = serde_json::from_value(serde_json::json!({
@@ -114,7 +119,11 @@ fn windows(simulator: &Simulator) -> anyhow::Result<Vec<WindowRow>> {
                 payload_kg,
                 channel: channel.name.clone(),
                 band_s: mean_s(band.collect()),
-                paper_s: mean_s(runs.iter().filter_map(|run| paper_steps(&run.columns[k])).collect()),
+                paper_s: mean_s(
+                    runs.iter()
+                        .filter_map(|run| paper_steps(&run.columns[k]))
+                        .collect(),
+                ),
                 runs: runs.len() as u64,
             });
         }
@@ -123,7 +132,10 @@ fn windows(simulator: &Simulator) -> anyhow::Result<Vec<WindowRow>> {
 }
 
 fn windows_text(out: &mut String, machine: &MachineSummary, windows: &[WindowRow]) -> std::fmt::Result {
-    writeln!(out, "\nsmall motions in the middle of the range, valves shut: decay 1/s (frequency Hz), slowest first")?;
+    writeln!(
+        out,
+        "\nsmall motions in the middle of the range, valves shut: decay 1/s (frequency Hz), slowest first"
+    )?;
     for row in &machine.small_motions {
         write!(out, "  {:10.1} kg ", row.payload_kg)?;
         if let Some(failure) = &row.failure {
@@ -135,11 +147,21 @@ fn windows_text(out: &mut String, machine: &MachineSummary, windows: &[WindowRow
         }
         writeln!(out)?;
     }
-    writeln!(out, "\nwindows: decay of the slowest motion to 1 %, and {SETTLING_RUNS} settling runs, s")?;
-    writeln!(out, "  {:>10} {:>12} {:>8} {:>8}  channel", "payload kg", "eigenvalues", "band", "paper")?;
+    writeln!(
+        out,
+        "\nwindows: decay of the slowest motion to 1 %, and {SETTLING_RUNS} settling runs, s"
+    )?;
+    writeln!(
+        out,
+        "  {:>10} {:>12} {:>8} {:>8}  channel",
+        "payload kg", "eigenvalues", "band", "paper"
+    )?;
     let seconds = |s: Option<f64>| s.map_or_else(|| "none".to_owned(), |s| format!("{s:.3}"));
     for row in windows {
-        let small = machine.small_motions.iter().find(|s| s.payload_kg.total_cmp(&row.payload_kg).is_eq());
+        let small = machine
+            .small_motions
+            .iter()
+            .find(|s| s.payload_kg.total_cmp(&row.payload_kg).is_eq());
         writeln!(
             out,
             "  {:10.1} {:>12} {:>8} {:>8}  {}",

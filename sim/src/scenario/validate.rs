@@ -156,7 +156,10 @@ fn angles(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
             range[0] <= range[1] && allowed().any(|[min, max]| min <= range[0] && range[1] <= max),
             pointer,
             range,
-            format!("[from, to] within {} degrees, from not above to", listed.join(", or ")),
+            format!(
+                "[from, to] within {} degrees, from not above to",
+                listed.join(", or ")
+            ),
         );
     }
 }
