@@ -14,12 +14,12 @@ use hydroflex_ledger::blobs::{BlobError, Blobs};
 use hydroflex_ledger::keys::{self, Scope};
 use hydroflex_ledger::transition::{ATTEMPT_LIMIT, ShardState};
 use hydroflex_ledger::{
-    CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, NewJob, NewModel, ShardKind,
-    ShardResult,
+    AliasCondition, AliasMove, CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset,
+    NewJob, NewModel, ShardKind, ShardResult,
 };
 use hydroflex_openapi::catalogue::FileEntry;
 use hydroflex_openapi::event::EventKind;
-use hydroflex_openapi::id::{DatasetId, JobId, ModelId};
+use hydroflex_openapi::id::{AliasName, DatasetId, JobId, ModelId};
 use hydroflex_openapi::job::{JobSpec, TrainingSpec};
 use hydroflex_openapi::status::{JobState, TimeSplit, TrainingProgress, TrainingState};
 
@@ -124,6 +124,7 @@ on_every_engine![
     given_up_runs_are_done_again_and_nothing_else,
     failed_trainings_are_done_again_and_nothing_else,
     a_key_is_found_by_its_hash_until_it_is_revoked,
+    of_two_who_move_an_alias_one_wins,
 ];
 
 /// A directory, and a bucket of a name of its own; `None` where there is no S3 server.
@@ -962,4 +963,52 @@ async fn failed_trainings_are_done_again_and_nothing_else(ledger: Ledger) {
     let job = ledger.job(id).await.unwrap().unwrap();
     assert_eq!(job.state, JobState::Succeeded);
     assert!(!ledger.retry_job(id).await.unwrap());
+}
+
+async fn of_two_who_move_an_alias_one_wins(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    finish_runs(&ledger, id).await;
+    let specs = vec![TrainingSpec::default(); 2];
+    assert!(ledger.publish_dataset(id, &new_dataset(), &specs).await.unwrap());
+    let mut models = Vec::new();
+    for sha256 in [HASH.to_owned(), HASH.replace("9f", "8e")] {
+        let claim = ledger.begin_training("a").await.unwrap().unwrap();
+        let model = NewModel {
+            id: ModelId::of_sha256(&sha256).unwrap(),
+            sha256,
+            metrics: serde_json::json!({}),
+            files: Vec::new(),
+        };
+        assert!(ledger.commit_training(&claim, &model).await.unwrap());
+        models.push(model.id);
+    }
+    let alias: AliasName = "boom@stable".parse().unwrap();
+    let go = |model: usize, condition| {
+        let (ledger, alias, model) = (ledger.clone(), alias.clone(), models[model].clone());
+        async move { ledger.move_alias(&alias, &model, condition).await.unwrap() }
+    };
+    assert!(ledger.alias(&alias).await.unwrap().is_none());
+    assert_eq!(go(0, AliasCondition::Present).await, AliasMove::Refused(None));
+    assert!(
+        matches!(go(0, AliasCondition::Absent).await, AliasMove::Moved(record) if record.generation == 1)
+    );
+    assert!(matches!(
+        go(1, AliasCondition::Absent).await,
+        AliasMove::Refused(Some(_))
+    ));
+    assert!(
+        matches!(go(0, AliasCondition::None).await, AliasMove::Unchanged(record) if record.generation == 1)
+    );
+    // Both saw generation 1.
+    let moves = futures::future::join_all((0..6).map(|_| go(1, AliasCondition::Generation(1)))).await;
+    let moved = moves
+        .iter()
+        .filter(|outcome| matches!(outcome, AliasMove::Moved(_)))
+        .count();
+    assert_eq!(moved, 1, "{moves:?}");
+    let history = ledger.alias_history(&alias).await.unwrap();
+    let pointed: Vec<&ModelId> = history.iter().map(|record| &record.model_id).collect();
+    assert_eq!(pointed, [&models[0], &models[1]]);
+    let now = ledger.aliases().await.unwrap();
+    assert_eq!((now.len(), now[0].generation), (1, 2));
 }
