@@ -8,7 +8,7 @@ use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
 };
-use sqlx::{Postgres, Row as _, Sqlite};
+use sqlx::{Connection as _, Postgres, Row as _, Sqlite};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -179,9 +179,12 @@ impl Pool {
                 .synchronous(SqliteSynchronous::Full)
                 .busy_timeout(BUSY_TIMEOUT)
                 .foreign_keys(true);
+            // On a full disk SQLite may end a transaction by itself, which sqlx does not notice: such a
+            // connection refuses every further transaction, so it is closed instead of handed out again.
             let pool = SqlitePoolOptions::new()
                 .max_connections(connections)
                 .acquire_timeout(BUSY_TIMEOUT)
+                .before_acquire(|connection, _| Box::pin(async move { Ok(!connection.is_in_transaction()) }))
                 .connect_with(options)
                 .await?;
             Ok(Self::Sqlite(pool))

@@ -81,6 +81,8 @@ impl LedgerError {
                 | sqlx::Error::PoolTimedOut
                 | sqlx::Error::PoolClosed
                 | sqlx::Error::WorkerCrashed
+                | sqlx::Error::BeginFailed
+                | sqlx::Error::InvalidSavePointStatement
                 | sqlx::Error::Protocol(_) => true,
                 sqlx::Error::Database(database) => database.code().is_some_and(|code| {
                     // SQLite: BUSY 5, LOCKED 6, IOERR 10, FULL 13 (extended codes share the low byte).

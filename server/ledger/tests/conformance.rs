@@ -1012,3 +1012,45 @@ async fn of_two_who_move_an_alias_one_wins(ledger: Ledger) {
     let now = ledger.aliases().await.unwrap();
     assert_eq!((now.len(), now[0].generation), (1, 2));
 }
+
+/// SQLite ends a transaction by itself when the disk is full, and sqlx does not notice: once the disk has
+/// room again, no connection may be left that refuses to work.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_disk_that_was_full_spoils_no_connection() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |program: &str, arguments: &[&str]| {
+        let done = std::process::Command::new(program)
+            .args(arguments)
+            .arg(folder.path())
+            .status();
+        done.is_ok_and(|status| status.success())
+    };
+    if !run("mount", &["-t", "tmpfs", "-o", "size=2m", "hydroflex-test"]) {
+        eprintln!("only root can make a small disk: left out");
+        return;
+    }
+    let ledger = sqlite(&folder).await;
+    let filler = folder.path().join("filler");
+    for round in 0..5 {
+        // Writes as much as there is room for, and then fails.
+        assert!(std::fs::write(&filler, vec![1_u8; 4 << 20]).is_err());
+        let mut refused = 0;
+        for _ in 0..40 {
+            match ledger.create_job(&new_job(&[1; 50]), None).await {
+                Ok(_) => {}
+                Err(error) => {
+                    assert!(error.is_transient(), "{error}");
+                    refused += 1;
+                }
+            }
+        }
+        assert!(refused > 0, "round {round}: the disk was not full");
+        std::fs::remove_file(&filler).unwrap();
+        for _ in 0..10 {
+            let made = ledger.create_job(&new_job(&[1]), None).await;
+            assert!(made.is_ok(), "round {round}: {made:?}");
+        }
+    }
+    ledger.close().await;
+    assert!(run("umount", &[]));
+}
