@@ -39,6 +39,8 @@ enum Command {
     Model(commands::model::Command),
     /// Estimate deflection, strain and stress from recorded sensor signals
     Predict(commands::predict::Args),
+    /// Repeat the published study: simulate, train the grid, evaluate, write the report
+    ReproducePaper(commands::reproduce::Args),
 }
 
 fn main() -> std::process::ExitCode {
@@ -55,6 +57,7 @@ fn main() -> std::process::ExitCode {
         Command::Evaluate(args) => commands::evaluate::run(args),
         Command::Model(command) => commands::model::run(command),
         Command::Predict(args) => commands::predict::run(args),
+        Command::ReproducePaper(args) => commands::reproduce::run(args),
     };
     match result {
         Ok(()) => std::process::ExitCode::SUCCESS,

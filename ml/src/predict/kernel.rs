@@ -25,41 +25,27 @@ pub struct PackedLayer {
     panels: Vec<f32>,
     bias: Vec<f32>,
     activations: Vec<Activation>,
-    /// Outputs from here on skip the activation.
-    activated: usize,
 }
 
 impl PackedLayer {
-    /// Packs `map`, activated throughout.
-    #[must_use]
-    pub fn new(map: &LinearWeights, activations: &[Activation]) -> Self {
-        Self::with_linear_tail(map, activations, &LinearWeights::default())
-    }
-
-    /// Packs `map` followed by the outputs of `tail`, which takes the same inputs and is left
-    /// linear: the first layer and the skip connection in one pass over the window.
+    /// Packs `map`.
     ///
     /// # Panics
-    /// When the two take another number of inputs.
+    /// When weights and biases do not fit.
     #[must_use]
-    pub fn with_linear_tail(map: &LinearWeights, activations: &[Activation], tail: &LinearWeights) -> Self {
-        let activated = map.bias.len();
-        let outputs = activated + tail.bias.len();
-        let inputs = (map.weight.len() + tail.weight.len()) / outputs;
-        assert_eq!(map.weight.len(), activated * inputs, "weights fit biases");
+    pub fn new(map: &LinearWeights, activations: &[Activation]) -> Self {
+        let outputs = map.bias.len();
+        let inputs = map.weight.len() / outputs.max(1);
+        assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
         let panel_count = outputs.div_ceil(LANES);
         let mut panels = vec![0.0; panel_count * inputs * LANES];
-        let rows = map
-            .weight
-            .chunks(inputs.max(1))
-            .chain(tail.weight.chunks(inputs.max(1)));
-        for (output, row) in rows.enumerate() {
+        for (output, row) in map.weight.chunks(inputs.max(1)).enumerate() {
             let panel = &mut panels[output / LANES * inputs * LANES..];
             for (input, &weight) in row.iter().enumerate() {
                 panel[input * LANES + output % LANES] = weight;
             }
         }
-        let mut bias: Vec<f32> = map.bias.iter().chain(&tail.bias).copied().collect();
+        let mut bias = map.bias.clone();
         bias.resize(panel_count * LANES, 0.0);
         Self {
             inputs,
@@ -67,7 +53,6 @@ impl PackedLayer {
             panels,
             bias,
             activations: activations.to_vec(),
-            activated,
         }
     }
 
@@ -206,36 +191,31 @@ impl PackedLayer {
                     values[lane] += self.bias[first + lane];
                 }
                 for &activation in &self.activations {
-                    self.activate_panel(activation, first, &mut values);
+                    activate_panel(activation, &mut values);
                 }
                 target.copy_from_slice(&values);
             }
         }
     }
+}
 
-    #[inline(always)]
-    fn activate_panel(&self, activation: Activation, first: usize, values: &mut [f32; LANES]) {
-        let linear = *values;
-        // One match per panel, so that each arm is a vector loop.
-        match activation {
-            Activation::Tanh => values
-                .iter_mut()
-                .for_each(|v| *v = activate(Activation::Tanh, *v)),
-            Activation::Sigmoid => values
-                .iter_mut()
-                .for_each(|v| *v = activate(Activation::Sigmoid, *v)),
-            Activation::Relu => values
-                .iter_mut()
-                .for_each(|v| *v = activate(Activation::Relu, *v)),
-            Activation::Elu => values.iter_mut().for_each(|v| *v = activate(Activation::Elu, *v)),
-            Activation::Silu => values
-                .iter_mut()
-                .for_each(|v| *v = activate(Activation::Silu, *v)),
-        }
-        if first + LANES > self.activated {
-            let kept = self.activated.saturating_sub(first);
-            values[kept..].copy_from_slice(&linear[kept..]);
-        }
+#[inline(always)]
+fn activate_panel(activation: Activation, values: &mut [f32; LANES]) {
+    // One match per panel, so that each arm is a vector loop.
+    match activation {
+        Activation::Tanh => values
+            .iter_mut()
+            .for_each(|v| *v = activate(Activation::Tanh, *v)),
+        Activation::Sigmoid => values
+            .iter_mut()
+            .for_each(|v| *v = activate(Activation::Sigmoid, *v)),
+        Activation::Relu => values
+            .iter_mut()
+            .for_each(|v| *v = activate(Activation::Relu, *v)),
+        Activation::Elu => values.iter_mut().for_each(|v| *v = activate(Activation::Elu, *v)),
+        Activation::Silu => values
+            .iter_mut()
+            .for_each(|v| *v = activate(Activation::Silu, *v)),
     }
 }
 
@@ -313,20 +293,6 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn a_linear_tail_is_not_activated() {
-        let (head, tail) = (map(20, 5, 1), map(3, 5, 2));
-        let layer = PackedLayer::with_linear_tail(&head, &[Activation::Relu], &tail);
-        let x = [-1.0, 0.5, 2.0, -0.25, 1.0];
-        let mut out = vec![0.0; layer.padded()];
-        layer.forward(&x, 5, 1, &mut out);
-        for o in 0..3 {
-            let z: f32 = tail.bias[o] + (0..5).map(|i| tail.weight[o * 5 + i] * x[i]).sum::<f32>();
-            assert!((out[20 + o] - z).abs() < 1e-6);
-        }
-        assert!(out[..20].iter().all(|v| *v >= 0.0));
     }
 
     #[test]

@@ -5,11 +5,13 @@
 //! overlap in memory, so sliding over a recording copies nothing either.
 
 pub mod kernel;
+pub mod skip;
 
 use crate::model::weights::{Auxiliary, Weights};
 use crate::scaling::Scaling;
-use hydroflex_openapi::model::{IntervalTable, ModelConfig};
+use hydroflex_openapi::model::{EnvelopeGroup, IntervalTable, ModelConfig};
 use kernel::PackedLayer;
+use skip::SkipKernel;
 
 /// Rows computed at once; activations of a block stay in the second-level cache.
 const BLOCK_ROWS: usize = 48;
@@ -20,11 +22,11 @@ pub struct Predictor {
     steps: usize,
     inputs: Scaling,
     targets: Scaling,
-    /// First to last; the first one also holds the skip as a linear tail.
+    /// Scaled values at which inputs are held; infinite where they are not.
+    limits: Vec<[f64; 2]>,
+    /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
-    /// Outputs of the first layer that belong to the network; what follows is the skip.
-    first_width: usize,
-    has_skip: bool,
+    skip: Option<SkipKernel>,
     intervals: Vec<IntervalTable>,
     envelope: Option<EnvelopeKernel>,
 }
@@ -32,8 +34,7 @@ pub struct Predictor {
 #[derive(Debug, Clone, PartialEq)]
 struct EnvelopeKernel {
     projection: PackedLayer,
-    components: usize,
-    limit: f64,
+    groups: Vec<EnvelopeGroup>,
     min: Vec<f64>,
     max: Vec<f64>,
 }
@@ -41,12 +42,59 @@ struct EnvelopeKernel {
 /// Scratch memory of one thread.
 #[derive(Debug, Clone)]
 pub struct Workspace {
-    window: Vec<f32>,
-    scaled: Vec<f32>,
+    /// Windows as the network and as the skip take them.
+    window: Scaled,
+    /// Estimates, scaled.
+    estimates: Vec<f64>,
     ping: Vec<f32>,
     pong: Vec<f32>,
-    skip: Vec<f32>,
+    skip: Vec<f64>,
     projected: Vec<f32>,
+}
+
+/// Mean square of the coordinates of each group.
+pub fn group_squares<'a>(
+    groups: &'a [EnvelopeGroup],
+    coordinates: &'a [f32],
+) -> impl Iterator<Item = f64> + 'a {
+    let mut rest = coordinates;
+    groups.iter().map(move |group| {
+        let (head, tail) = rest.split_at(group.components);
+        rest = tail;
+        let sum: f64 = head.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+        sum / group.components.max(1) as f64
+    })
+}
+
+fn scaled_limits(config: &ModelConfig) -> Vec<[f64; 2]> {
+    let scaled = |input: usize, value: f64| {
+        let channel = &config.inputs[input];
+        (value - channel.offset) / channel.scale
+    };
+    (0..config.inputs.len())
+        .map(|input| {
+            config
+                .input_limits
+                .get(input)
+                .map_or([f64::NEG_INFINITY, f64::INFINITY], |limits| {
+                    limits.map(|value| scaled(input, value))
+                })
+        })
+        .collect()
+}
+
+/// Scaled values in both precisions.
+#[derive(Debug, Clone, Default)]
+struct Scaled {
+    single: Vec<f32>,
+    double: Vec<f64>,
+}
+
+impl Scaled {
+    fn resize(&mut self, values: usize) {
+        self.single.resize(values, 0.0);
+        self.double.resize(values, 0.0);
+    }
 }
 
 /// Estimates of a recording: row k of every column belongs to sample `first_row + k`.
@@ -64,24 +112,27 @@ impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let empty = crate::model::weights::LinearWeights::default();
-        let skip = weights.skip.as_ref();
-        let mut layers = Vec::with_capacity(weights.layers.len().max(1));
-        for (position, (layer, map)) in config.layers.iter().zip(&weights.layers).enumerate() {
-            let tail = skip.filter(|_| position == 0).unwrap_or(&empty);
-            layers.push(PackedLayer::with_linear_tail(map, &layer.activations, tail));
-        }
-        if layers.is_empty() {
-            layers.push(PackedLayer::new(skip.unwrap_or(&empty), &[]));
-        }
+        let layers = config
+            .layers
+            .iter()
+            .zip(&weights.layers)
+            .map(|(layer, map)| PackedLayer::new(map, &layer.activations))
+            .collect();
+        let skip = weights.skip.as_ref().map(|map| {
+            SkipKernel::new(
+                map,
+                config.schedule.as_ref(),
+                &config.inputs,
+                config.targets.len(),
+            )
+        });
         let envelope = config
             .envelope
             .as_ref()
             .zip(auxiliary.envelope.as_ref())
             .map(|(envelope, map)| EnvelopeKernel {
                 projection: PackedLayer::new(map, &[]),
-                components: envelope.components,
-                limit: envelope.limit,
+                groups: envelope.groups.clone(),
                 min: envelope.min.clone(),
                 max: envelope.max.clone(),
             });
@@ -89,9 +140,9 @@ impl Predictor {
             steps: config.window_steps,
             inputs: Scaling::from_config(&config.inputs),
             targets: Scaling::from_config(&config.targets),
-            first_width: config.layers.first().map_or(0, |layer| layer.outputs),
-            has_skip: skip.is_some(),
+            limits: scaled_limits(config),
             layers,
+            skip,
             intervals: config.intervals.clone(),
             envelope,
         }
@@ -138,11 +189,11 @@ impl Predictor {
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
         Workspace {
-            window: vec![0.0; self.window_len()],
-            scaled: vec![0.0; BLOCK_ROWS * self.targets.len()],
+            window: Scaled::default(),
+            estimates: vec![0.0; BLOCK_ROWS * self.targets.len()],
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
-            skip: vec![0.0; BLOCK_ROWS * self.targets.len()],
+            skip: vec![0.0; BLOCK_ROWS * self.skip.as_ref().map_or(0, SkipKernel::padded)],
             projected: vec![
                 0.0;
                 self.envelope
@@ -161,8 +212,9 @@ impl Predictor {
         assert_eq!(window.len(), self.window_len(), "values of a window");
         assert_eq!(out.len(), self.targets.len(), "one estimate per target");
         let mut scaled = std::mem::take(&mut workspace.window);
+        scaled.resize(window.len());
         self.scale_rows(window, &mut scaled);
-        self.block(&scaled, scaled.len(), 1, workspace);
+        self.block(&scaled, 0, window.len(), 1, workspace);
         workspace.window = scaled;
         self.unscale(1, out, workspace);
     }
@@ -181,17 +233,16 @@ impl Predictor {
             "one row of estimates per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
-        scaled.resize(BLOCK_ROWS * size, 0.0);
+        scaled.resize(BLOCK_ROWS * size);
         for (block, estimates) in windows
             .chunks(BLOCK_ROWS * size)
             .zip(out.chunks_mut(BLOCK_ROWS * self.targets.len()))
         {
             self.scale_rows(block, &mut scaled);
             let rows = block.len() / size;
-            self.block(&scaled, size, rows, workspace);
+            self.block(&scaled, 0, size, rows, workspace);
             self.unscale(rows, estimates, workspace);
         }
-        scaled.truncate(size);
         workspace.window = scaled;
     }
 
@@ -216,10 +267,12 @@ impl Predictor {
         let rows = columns[0].len();
         assert!(columns.iter().all(|c| c.len() == rows), "columns of one length");
         let width = self.inputs.len();
-        let mut scaled = vec![0.0_f32; rows * width];
+        let mut scaled = Scaled::default();
+        scaled.resize(rows * width);
         for (channel, column) in columns.iter().enumerate() {
-            self.inputs
-                .scale_column(channel, column, &mut scaled[channel..], width);
+            for (row, &value) in column.iter().enumerate() {
+                self.scale_value(channel, value, &mut scaled, row * width + channel);
+            }
         }
         let count = (rows + 1).saturating_sub(self.steps);
         let targets = self.targets.len();
@@ -228,13 +281,13 @@ impl Predictor {
         let mut first = 0;
         while first < count {
             let block = BLOCK_ROWS.min(count - first);
-            let x = &scaled[first * width..];
-            self.block(x, width, block, workspace);
-            for row in workspace.scaled[..block * targets].chunks(targets) {
+            self.block(&scaled, first * width, width, block, workspace);
+            for row in workspace.estimates[..block * targets].chunks(targets) {
                 for (t, (column, &value)) in estimates.iter_mut().zip(row).enumerate() {
-                    column.push(self.targets.unscale(t, f64::from(value)));
+                    column.push(self.targets.unscale(t, value));
                 }
             }
+            let x = &scaled.single[first * width..];
             self.inside_block(x, width, block, &mut inside, workspace);
             first += block;
         }
@@ -267,49 +320,45 @@ impl Predictor {
                 .all(|((v, min), max)| v >= min && v <= max)
         });
         let mut scaled = std::mem::take(&mut workspace.window);
+        scaled.resize(window.len());
         self.scale_rows(window, &mut scaled);
         let mut inside = Vec::with_capacity(1);
-        self.inside_block(&scaled, scaled.len(), 1, &mut inside, workspace);
+        self.inside_block(&scaled.single, window.len(), 1, &mut inside, workspace);
         workspace.window = scaled;
         Some(in_range && inside == [true])
     }
 
-    /// Network output for scaled windows that begin `stride` values apart, one row of scaled
-    /// targets per window in `workspace.scaled`.
-    fn block(&self, x: &[f32], stride: usize, rows: usize, workspace: &mut Workspace) {
+    /// Estimates for scaled windows that begin at value `first` and `stride` values apart, one row of
+    /// scaled targets per window in `workspace.estimates`.
+    fn block(&self, scaled: &Scaled, first: usize, stride: usize, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
         let Workspace {
-            scaled,
+            estimates,
             ping,
             pong,
             skip,
             ..
         } = workspace;
-        self.layers[0].forward(x, stride, rows, ping);
-        let padded = self.layers[0].padded();
-        if self.has_skip {
-            for (row, out) in skip[..rows * targets].chunks_mut(targets).enumerate() {
-                out.copy_from_slice(&ping[row * padded + self.first_width..][..targets]);
+        let estimates = &mut estimates[..rows * targets];
+        if let Some((layer, others)) = self.layers.split_first() {
+            layer.forward(&scaled.single[first..], stride, rows, ping);
+            let (mut from, mut to) = (ping, pong);
+            let mut width = layer.padded();
+            for layer in others {
+                layer.forward(from, width, rows, to);
+                width = layer.padded();
+                std::mem::swap(&mut from, &mut to);
             }
-        }
-        let (mut from, mut to) = (ping, pong);
-        let mut width = padded;
-        for layer in &self.layers[1..] {
-            layer.forward(from, width, rows, to);
-            width = layer.padded();
-            std::mem::swap(&mut from, &mut to);
-        }
-        if self.first_width == 0 {
-            scaled[..rows * targets].copy_from_slice(&skip[..rows * targets]);
-            return;
-        }
-        for (row, out) in scaled[..rows * targets].chunks_mut(targets).enumerate() {
-            out.copy_from_slice(&from[row * width..][..targets]);
-            if self.has_skip {
-                for (o, s) in out.iter_mut().zip(&skip[row * targets..]) {
-                    *o += s;
+            for (row, out) in estimates.chunks_mut(targets).enumerate() {
+                for (slot, &value) in out.iter_mut().zip(&from[row * width..]) {
+                    *slot = f64::from(value);
                 }
             }
+        } else {
+            estimates.fill(0.0);
+        }
+        if let Some(kernel) = &self.skip {
+            kernel.add(&scaled.double[first..], stride, rows, skip, estimates);
         }
     }
 
@@ -327,8 +376,11 @@ impl Predictor {
             .forward(x, stride, rows, &mut workspace.projected);
         let padded = envelope.projection.padded();
         for row in workspace.projected[..rows * padded].chunks(padded) {
-            let squares: f32 = row[..envelope.components].iter().map(|v| v * v).sum();
-            inside.push(f64::from(squares) <= envelope.limit * envelope.components as f64);
+            inside.push(
+                group_squares(&envelope.groups, row)
+                    .zip(&envelope.groups)
+                    .all(|(square, group)| square <= group.limit),
+            );
         }
     }
 
@@ -348,24 +400,29 @@ impl Predictor {
         }
     }
 
-    #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-    fn scale_rows(&self, rows: &[f64], out: &mut [f32]) {
+    fn scale_rows(&self, rows: &[f64], out: &mut Scaled) {
         let width = self.inputs.len();
-        for (row, slots) in rows.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-            for (channel, (value, slot)) in row.iter().zip(slots).enumerate() {
-                *slot = self.inputs.scale(channel, *value) as f32;
-            }
+        for (position, &value) in rows.iter().enumerate() {
+            self.scale_value(position % width, value, out, position);
         }
+    }
+
+    #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+    fn scale_value(&self, channel: usize, value: f64, out: &mut Scaled, position: usize) {
+        let [low, high] = self.limits[channel];
+        let scaled = self.inputs.scale(channel, value).clamp(low, high);
+        out.double[position] = scaled;
+        out.single[position] = scaled as f32;
     }
 
     fn unscale(&self, rows: usize, out: &mut [f64], workspace: &Workspace) {
         let targets = self.targets.len();
         for (estimates, row) in out
             .chunks_mut(targets)
-            .zip(workspace.scaled[..rows * targets].chunks(targets))
+            .zip(workspace.estimates[..rows * targets].chunks(targets))
         {
             for (t, (slot, &value)) in estimates.iter_mut().zip(row).enumerate() {
-                *slot = self.targets.unscale(t, f64::from(value));
+                *slot = self.targets.unscale(t, value);
             }
         }
     }

@@ -11,6 +11,7 @@ pub mod train;
 pub mod evaluate;
 pub mod model;
 pub mod predict;
+pub mod reproduce;
 mod log;
 
 use anyhow::Context as _;
