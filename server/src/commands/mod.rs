@@ -11,7 +11,7 @@ pub mod train;
 pub mod evaluate;
 pub mod model;
 pub mod predict;
-pub mod reproduce;
+pub mod paper;
 mod log;
 
 use anyhow::Context as _;
