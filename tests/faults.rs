@@ -1,7 +1,8 @@
 //! Whatever dies on the way: a job ends with the same data set as if nothing had happened.
 
+use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::status::{JobState, JobStatus};
-use hydroflex_tests::{ServiceUnderTest, Start, signal};
+use hydroflex_tests::{Pilot, ServiceUnderTest, Start, servers, signal};
 use nix::sys::signal::Signal;
 use std::path::Path;
 use std::sync::OnceLock;
@@ -218,13 +219,140 @@ fn a_run_that_kills_its_worker_is_isolated_and_every_other_run_delivered() {
         ..Start::default()
     };
     let service = ServiceUnderTest::start(folder.path(), &start).unwrap();
-    let id = service.submit(&job(40)).unwrap().job_id.to_string();
+    let id = service.submit(&job(RUNS)).unwrap().job_id.to_string();
     let status = service.wait_for(&id, finished).unwrap();
     check_whole(&service, &status);
     assert_eq!(status.progress.runs_failed, 1);
     let events = String::from_utf8(service.get(&format!("/v1/jobs/{id}/events")).unwrap()).unwrap();
     assert!(events.contains("\"outcome\":\"given_up\""), "{events}");
     assert!(events.contains("\"outcome\":\"halved\""), "{events}");
+    // With the cause gone, that run alone is done again; the data set is then the undisturbed one.
+    service.terminate().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &workers(1)).unwrap();
+    service.post(&format!("/v1/jobs/{id}/retry")).unwrap();
+    let status = service.wait_for(&id, finished).unwrap();
+    check_same(&service, &status);
+    service
+        .wait_for(&id, |_| shard_objects(folder.path()) == 0)
+        .unwrap();
+}
+
+/// A run that hangs, or eats memory, without end: others are delivered, and the reason is recorded.
+fn a_run_that_never_ends_is_isolated(how: &str, limits: &[(&'static str, &str)], reason: &str) {
+    const BAD: u64 = 5;
+    let folder = tempfile::tempdir().unwrap();
+    let mut start = Start {
+        workers: 2,
+        environment: vec![
+            ("HYDROFLEX_CRASH_WORKER_AT", format!("run-{BAD}")),
+            ("HYDROFLEX_CRASH_HOW", how.to_owned()),
+        ],
+        ..Start::default()
+    };
+    for (name, value) in limits {
+        start.environment.push((*name, (*value).to_owned()));
+    }
+    let service = ServiceUnderTest::start(folder.path(), &start).unwrap();
+    let id = service.submit(&job(8)).unwrap().job_id.to_string();
+    let status = service.wait_for(&id, finished).unwrap();
+    check_whole(&service, &status);
+    assert_eq!(status.progress.runs_failed, 1);
+    let events = String::from_utf8(service.get(&format!("/v1/jobs/{id}/events")).unwrap()).unwrap();
+    let given_up = events
+        .lines()
+        .find(|line| line.contains("\"outcome\":\"given_up\""))
+        .unwrap_or_else(|| panic!("{events}"));
+    assert!(given_up.contains(&format!("\"first_run\":{BAD}")), "{given_up}");
+    assert!(given_up.contains(reason), "{given_up}");
+}
+
+#[test]
+fn a_run_that_hangs_is_isolated_and_every_other_run_delivered() {
+    a_run_that_never_ends_is_isolated(
+        "hang",
+        &[("HYDROFLEX_RUN_LIMIT", "1")],
+        "a run took longer than 1 s",
+    );
+}
+
+#[test]
+fn a_run_that_eats_memory_is_isolated_and_every_other_run_delivered() {
+    a_run_that_never_ends_is_isolated(
+        "eat",
+        &[("HYDROFLEX_MEMORY_LIMIT", "512")],
+        "a run took more than 512 MiB of memory",
+    );
+}
+
+#[test]
+fn a_run_is_shown_again_and_a_data_set_made_again_from_its_manifest() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &workers(1)).unwrap();
+    let mut urgent = job(RUNS);
+    urgent["priority"] = 7.into();
+    let id = service.submit(&urgent).unwrap().job_id.to_string();
+    let status = service.wait_for(&id, finished).unwrap();
+    // When its turn came is no part of it.
+    check_same(&service, &status);
+    let cache = folder.path().join("cache").display().to_string();
+    let dataset = folder.path().join("set").display().to_string();
+    let fetched = status.dataset_id.as_ref().unwrap().to_string();
+    hydroflex_tests::command(&[
+        "dataset",
+        "fetch",
+        &fetched,
+        "--out",
+        &dataset,
+        "--url",
+        service.url(),
+    ])
+    .unwrap();
+
+    let by_job = [
+        "rerun",
+        &id,
+        "--run",
+        "17",
+        "--json",
+        "--cache",
+        &cache,
+        "--url",
+        service.url(),
+    ];
+    let by_job: serde_json::Value =
+        serde_json::from_str(&hydroflex_tests::command(&by_job).unwrap()).unwrap();
+    let csv = folder.path().join("run.csv").display().to_string();
+    let by_manifest = [
+        "rerun", &dataset, "--run", "17", "--json", "--cache", &cache, "--out", &csv,
+    ];
+    let by_manifest: serde_json::Value =
+        serde_json::from_str(&hydroflex_tests::command(&by_manifest).unwrap()).unwrap();
+    assert_eq!(by_job["channels"], by_manifest["channels"]);
+    assert_eq!(by_job["status"], "ok");
+    // The run as it is in the data set.
+    let published = hydroflex_dataset::Dataset::open(&dataset).unwrap();
+    let row = published.runs().iter().find(|row| row.run_id == 17).unwrap();
+    assert_eq!(by_job["seed"].as_u64(), row.seed);
+    assert_eq!(by_job["payload_kg"].as_f64(), Some(row.payload_kg));
+    let lines = std::fs::read_to_string(&csv).unwrap().lines().count();
+    assert_eq!(lines, 1 + 101);
+    let refused = hydroflex_tests::command(&["rerun", &dataset, "--run", "60", "--cache", &cache]);
+    let refused = refused.unwrap_err().to_string();
+    assert!(refused.contains("allowed is 0 to 59"), "{refused}");
+
+    let again = ["reproduce", &dataset, "--json", "--cache", &cache];
+    let again: serde_json::Value = serde_json::from_str(&hydroflex_tests::command(&again).unwrap()).unwrap();
+    assert_eq!(again["same"], true);
+    assert_eq!(again["dataset_sha256"].as_str(), status.dataset_sha256.as_deref());
+    // A manifest that promises other bytes is found out.
+    let path = Path::new(&dataset).join("manifest.json");
+    let mut manifest: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    manifest["source"]["spec"]["seed"] = 8.into();
+    std::fs::write(&path, manifest.to_string()).unwrap();
+    let other = hydroflex_tests::command(&["reproduce", &dataset, "--cache", &cache]);
+    let other = other.unwrap_err().to_string();
+    assert!(other.contains("data/train-00000-of-00001.parquet"), "{other}");
+    service.terminate().unwrap();
 }
 
 #[test]
@@ -348,4 +476,134 @@ fn a_killed_trainer_goes_on_and_ends_with_the_same_model() {
             .unwrap()
             .is_finite()
     );
+}
+
+/// Chosen parts of the environment's database and store; `None` where one of them is not installed.
+struct Shared {
+    database: String,
+    store: String,
+}
+
+fn postgres_and_s3(name: &str) -> Option<Shared> {
+    let store = servers::moto::shared()?;
+    let database = servers::postgres::fresh_database(name)?;
+    let bucket = name.replace('_', "-");
+    store.bucket(&bucket);
+    Some(Shared {
+        database,
+        store: format!("s3://{bucket}/runs"),
+    })
+}
+
+impl Shared {
+    fn start(&self, workers: usize) -> Start {
+        Start {
+            workers,
+            environment: self.environment(),
+            database: Some(self.database.clone()),
+            store: Some(self.store.clone()),
+        }
+    }
+
+    fn environment(&self) -> Vec<(&'static str, String)> {
+        let server = servers::moto::shared().unwrap();
+        servers::moto::environment(server.port())
+    }
+
+    fn objects(&self, below: &str) -> Vec<String> {
+        let variables = self
+            .environment()
+            .into_iter()
+            .map(|(name, value)| (name.to_owned(), value));
+        let blobs = Blobs::open_with(&self.store, variables).unwrap();
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        runtime.block_on(blobs.list(below)).unwrap()
+    }
+
+    fn pilot(&self, cache: &Path, arguments: &[&str]) -> Pilot {
+        Pilot::start(&self.database, &self.store, cache, &self.environment(), arguments).unwrap()
+    }
+}
+
+#[test]
+fn postgres_and_s3_with_four_workers_give_the_bytes_of_sqlite_and_a_directory_with_one() {
+    let Some(shared) = postgres_and_s3("four_workers") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &shared.start(2)).unwrap();
+    let cache = folder.path().join("pilots");
+    let pilots = [shared.pilot(&cache, &[]), shared.pilot(&cache, &[])];
+    let id = service.submit(&job(RUNS)).unwrap().job_id.to_string();
+    let status = service.wait_for(&id, finished).unwrap();
+    check_same(&service, &status);
+    // A reader takes a part of a file, and knows when it has it already.
+    let dataset = status.dataset_id.unwrap();
+    let path = format!("/v1/datasets/{dataset}/files/data/train-00000-of-00001.parquet");
+    let whole = service.get(&path).unwrap();
+    let part = service.get_range(&path, whole.len() as u64 - 8, None).unwrap();
+    assert_eq!(part.status, 206);
+    assert_eq!(part.body, whole[whole.len() - 8..]);
+    assert_eq!(part.etag, format!("\"{}\"", hydroflex_tests::sha256(&whole)));
+    let known = service.get_range(&path, 0, Some(&part.etag)).unwrap();
+    assert_eq!((known.status, known.body.len()), (304, 0));
+    service
+        .wait_for(&id, |_| shared.objects("shards").is_empty())
+        .unwrap();
+    for pilot in pilots {
+        pilot.terminate().unwrap();
+    }
+    service.terminate().unwrap();
+}
+
+#[test]
+fn of_two_coordinators_on_one_database_one_may_die() {
+    let Some(shared) = postgres_and_s3("two_coordinators") else {
+        return;
+    };
+    let (first, second) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let doomed = ServiceUnderTest::start(first.path(), &shared.start(1)).unwrap();
+    let other = ServiceUnderTest::start(second.path(), &shared.start(1)).unwrap();
+    let pilot = shared.pilot(&second.path().join("pilot"), &[]);
+    let id = doomed.submit(&job(RUNS)).unwrap().job_id.to_string();
+    other
+        .wait_for(&id, |s| finished(s) || s.progress.runs_done >= 10)
+        .unwrap();
+    doomed.kill().unwrap();
+    let status = other.wait_for(&id, finished).unwrap();
+    check_same(&other, &status);
+    other
+        .wait_for(&id, |_| shared.objects("shards").is_empty())
+        .unwrap();
+    pilot.terminate().unwrap();
+    other.terminate().unwrap();
+}
+
+#[test]
+fn a_pilot_drains_before_its_time_is_up_and_gives_its_shard_back_when_told_to() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &workers(0)).unwrap();
+    let database = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
+    let store = format!("file://{}", folder.path().join("store").display());
+    let pilot = |arguments: &[&str]| {
+        Pilot::start(&database, &store, &folder.path().join("cache"), &[], arguments).unwrap()
+    };
+    let id = service.submit(&job(100_000)).unwrap().job_id.to_string();
+    // One whose time is up ends by itself, without an error, and whatever it began is handed in.
+    pilot(&["--drain-after", "2"]).wait().unwrap();
+    let status = service.job(&id).unwrap();
+    assert!(status.progress.runs_done > 0, "{status:?}");
+    let told = pilot(&[]);
+    let before = status.progress.runs_done;
+    service
+        .wait_for(&id, |status| status.progress.runs_done > before)
+        .unwrap();
+    told.terminate().unwrap();
+    // Nothing was lost on the way: no attempt counts as failed.
+    let events = |id: &str| {
+        service.post(&format!("/v1/jobs/{id}/cancel")).unwrap();
+        String::from_utf8(service.get(&format!("/v1/jobs/{id}/events")).unwrap()).unwrap()
+    };
+    let events = events(&id);
+    assert!(!events.contains("\"outcome\":\"retried\""), "{events}");
 }

@@ -3,7 +3,7 @@
 # virtual environment made here). Needs the Rust toolchain and python3; installs the rest below target/.
 #
 #   tests/run.sh             everything
-#   tests/run.sh --rust      Rust only: no Python
+#   tests/run.sh --rust      Rust only: no Python, and no S3 unless HYDROFLEX_MOTO names moto's server program
 #
 # HYDROFLEX_REFERENCE=DIR adds the comparison with an independent solver's trajectories,
 # HYDROFLEX_ACCEPTANCE=DIR the script that judges them.
@@ -28,6 +28,15 @@ count() { # passed failed
 say "format"
 cargo fmt --all --check
 
+if ! $rust_only; then
+    say "Python packages"
+    venv=target/test-venv
+    if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
+    "$venv/bin/pip" install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+    # An S3 server for the Rust tests.
+    export HYDROFLEX_MOTO="$PWD/$venv/bin/moto_server"
+fi
+
 say "Rust tests (they share the build of every dependency with 'cargo run --release')"
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
@@ -41,9 +50,6 @@ if [ "$rust_status" -ne 0 ] && [ "$failed" -eq 0 ]; then count 0 1; fi
 
 if ! $rust_only; then
     say "tools people use (Python)"
-    venv=target/test-venv
-    if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
-    "$venv/bin/pip" install --quiet --disable-pip-version-check -r tests/python/requirements.txt
     # The Rust tests have built the binary; another `cargo build` would unify features anew and build burn again.
     for script in tests/python/test_*.py; do
         say "$script"

@@ -1,6 +1,6 @@
 //! What a service holds: data sets, models, machines.
 
-use crate::id::{DatasetId, JobId, ModelId, TrainingId};
+use crate::id::{AliasName, DatasetId, JobId, ModelId, TrainingId};
 use crate::job::{JobSpec, TrainingSpec};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -79,6 +79,35 @@ pub struct ModelPage {
     pub next_cursor: Option<String>,
 }
 
+/// Where an alias is to point.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct AliasRequest {
+    /// The model; it is loaded and checked before the alias moves.
+    pub model_id: ModelId,
+}
+
+/// An alias: a name for a model that can be moved to another one.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AliasInfo {
+    /// Its name.
+    pub alias: AliasName,
+    /// The model that it points at.
+    pub model_id: ModelId,
+    /// Counts from 1 with every move; also the ETag. Earlier ones stay addressable as versions of
+    /// the Open Inference Protocol.
+    pub generation: u64,
+    /// When it was moved there (RFC 3339, UTC).
+    pub moved_at: String,
+}
+
+/// Every alias, by name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct AliasList {
+    /// Aliases.
+    pub aliases: Vec<AliasInfo>,
+}
+
 /// A machine that the service carries.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct MachineInfo {
@@ -90,7 +119,7 @@ pub struct MachineInfo {
     pub cylinders: Vec<String>,
     /// Names of its angles.
     pub angles: Vec<String>,
-    /// False if its mesh must be given and the service cannot simulate it.
+    /// False if a job must give its meshes (`POST /v1/meshes`).
     pub available: bool,
     /// The machine file.
     pub toml: String,
@@ -101,4 +130,23 @@ pub struct MachineInfo {
 pub struct MachineList {
     /// Machines.
     pub machines: Vec<MachineInfo>,
+}
+
+/// An uploaded mesh.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MeshInfo {
+    /// SHA-256 of the file, 64 hexadecimal digits: what a job's `meshes` name.
+    pub mesh_sha256: String,
+    /// Size of the file.
+    pub size_bytes: u64,
+    /// Nodes.
+    pub nodes: u64,
+    /// Elements.
+    pub elements: u64,
+    /// `C3D4` or `C3D10`.
+    pub element_kind: String,
+    /// Volume of all elements.
+    pub volume_m3: f64,
+    /// Names of its node sets.
+    pub node_sets: Vec<String>,
 }

@@ -123,6 +123,94 @@ macro_rules! content_id {
 content_id!(DatasetId, "A data set, by its content.");
 content_id!(ModelId, "A model, by its content.");
 
+/// A name that points at a model and can be moved to another one: `boom@stable`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "String", into = "String")]
+#[schema(
+    value_type = String,
+    pattern = "^[a-z0-9][a-z0-9_.-]{0,62}@[a-z0-9][a-z0-9_.-]{0,62}$",
+    example = "boom@stable"
+)]
+pub struct AliasName(String);
+
+impl AliasName {
+    /// As text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for AliasName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl FromStr for AliasName {
+    type Err = IdError;
+    fn from_str(text: &str) -> Result<Self, IdError> {
+        let is_part = |part: &str| {
+            let first = part.bytes().next();
+            let is_letter = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit();
+            part.len() <= 63
+                && first.is_some_and(is_letter)
+                && part.bytes().all(|byte| is_letter(byte) || b"_.-".contains(&byte))
+        };
+        match text.split_once('@') {
+            Some((name, tag)) if is_part(name) && is_part(tag) => Ok(Self(text.to_owned())),
+            _ => Err(IdError {
+                text: text.to_owned(),
+                expected: "an alias such as boom@stable: two parts of lower-case letters, digits, `_`, `.`, `-`",
+            }),
+        }
+    }
+}
+
+impl TryFrom<String> for AliasName {
+    type Error = IdError;
+    fn try_from(text: String) -> Result<Self, IdError> {
+        text.parse()
+    }
+}
+
+impl From<AliasName> for String {
+    fn from(name: AliasName) -> Self {
+        name.0
+    }
+}
+
+/// A model by its content or by a name that points at it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum ModelRef {
+    /// By its content: always the same model.
+    Id(ModelId),
+    /// By the name that points at it now.
+    Alias(AliasName),
+}
+
+impl fmt::Display for ModelRef {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Id(id) => id.fmt(f),
+            Self::Alias(alias) => alias.fmt(f),
+        }
+    }
+}
+
+impl FromStr for ModelRef {
+    type Err = IdError;
+    fn from_str(text: &str) -> Result<Self, IdError> {
+        if let Ok(id) = text.parse() {
+            return Ok(Self::Id(id));
+        }
+        text.parse().map(Self::Alias).map_err(|_| IdError {
+            text: text.to_owned(),
+            expected: "a model (32 lower-case hexadecimal digits) or an alias such as boom@stable",
+        })
+    }
+}
+
 fn is_lower_hex(text: &str) -> bool {
     text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
 }
@@ -151,5 +239,30 @@ mod tests {
             assert!(text.parse::<JobId>().is_err(), "{text}");
         }
         assert!("019AAF3E-5D2C-7C31-9D0F-3C1F5A5E8D10".parse::<JobId>().is_err());
+    }
+    #[test]
+    fn aliases_are_two_plain_words() {
+        for text in ["boom@stable", "a@b", "crane-2.1@2026_11"] {
+            assert_eq!(text.parse::<AliasName>().unwrap().to_string(), text);
+            assert!(matches!(text.parse::<ModelRef>(), Ok(ModelRef::Alias(_))));
+        }
+        let long = "x".repeat(64);
+        for text in [
+            "",
+            "@",
+            "boom",
+            "boom@",
+            "@stable",
+            "Boom@stable",
+            "boom@a@b",
+            "../x@y",
+            "boom@..",
+            "boom@a/b",
+            &format!("{long}@a"),
+        ] {
+            assert!(text.parse::<AliasName>().is_err(), "{text}");
+        }
+        let id = "9f86d081884c7d659a2feaa0c55ad015";
+        assert!(matches!(id.parse::<ModelRef>(), Ok(ModelRef::Id(_))));
     }
 }

@@ -18,6 +18,10 @@ pub struct JobSpec {
     /// Built-in machine by name, or a machine file's text (TOML).
     #[serde(default = "default_machine")]
     pub machine: MachineRef,
+    /// Meshes that were uploaded, by body: `{"lift": "SHA-256 as POST /v1/meshes answered"}`. They go before
+    /// those the machine file names, and are needed where it says that a mesh is given.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub meshes: BTreeMap<String, String>,
     /// Number of runs.
     pub runs: u64,
     /// Seed of every random choice.
@@ -56,6 +60,15 @@ pub struct JobSpec {
     /// Networks to train when the data set is published.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub train: Vec<TrainingSpec>,
+    /// Jobs of higher priority go first, −100 to 100; of equal ones the older. No part of the data set.
+    #[serde(default, skip_serializing_if = "is_default_priority")]
+    #[schema(minimum = -100, maximum = 100)]
+    pub priority: i32,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_default_priority(priority: &i32) -> bool {
+    *priority == 0
 }
 
 fn default_machine() -> MachineRef {
@@ -75,6 +88,9 @@ fn default_settling_runs() -> u64 {
 }
 
 impl JobSpec {
+    /// Priorities that a job may have.
+    pub const PRIORITIES: std::ops::RangeInclusive<i32> = -100..=100;
+
     /// Steps of a run: its length in sample times, rounded. A run has one sample more.
     #[must_use]
     #[expect(

@@ -13,5 +13,7 @@ pub mod status;
 pub mod event;
 pub mod catalogue;
 pub mod prediction;
+pub mod inference;
+pub mod stream;
 pub mod problem;
 pub mod model;

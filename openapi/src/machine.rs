@@ -331,6 +331,9 @@ pub struct CylinderSpec {
     /// End stops at the stroke's limits; absent: the piston may leave the barrel, as published.
     #[serde(default)]
     pub end_stop: Option<EndStopSpec>,
+    /// Eye-to-eye lengths at which a random configuration may start; absent: anywhere within the stroke.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start_length_m: Option<[f64; 2]>,
     /// Lengths beyond which the valve is shut before a step, as published scripts do.
     #[serde(default)]
     pub stroke_cutoff: Option<StrokeCutoffSpec>,
@@ -453,6 +456,21 @@ pub struct AngleSpec {
     #[serde(default)]
     pub minus: Option<String>,
     /// Range of random configurations.
+    pub range_deg: [f64; 2],
+    /// Other ranges, where another angle says so; the first that fits counts.
+    #[serde(default, rename = "instead", skip_serializing_if = "Vec::is_empty")]
+    pub instead: Vec<InsteadSpec>,
+}
+
+/// A range that takes the place of an angle's own while another angle lies within limits.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InsteadSpec {
+    /// The other angle, by name; an earlier one.
+    pub angle: String,
+    /// It lies above the first of these and not above the second.
+    pub between_deg: [f64; 2],
+    /// The range then.
     pub range_deg: [f64; 2],
 }
 

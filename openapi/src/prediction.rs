@@ -34,6 +34,8 @@ pub struct PredictResponse {
     pub model_id: ModelId,
     /// The data set it learned from.
     pub dataset_id: DatasetId,
+    /// Hashes and versions behind the estimates.
+    pub provenance: PredictionProvenance,
     /// Time between estimates.
     pub sample_time_s: f64,
     /// Samples in a window.
@@ -44,8 +46,28 @@ pub struct PredictResponse {
     pub count: u64,
     /// Estimates by column name, in the unit of the name.
     pub estimates: BTreeMap<String, Vec<f64>>,
+    /// Lower ends of the 90 % intervals; absent if the model has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lower: Option<BTreeMap<String, Vec<f64>>>,
+    /// Upper ends of the 90 % intervals; absent if the model has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub upper: Option<BTreeMap<String, Vec<f64>>>,
     /// For each estimate, whether its window lies in the region that the model was trained on;
     /// absent if the model does not know that region.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub inside_envelope: Option<Vec<bool>>,
+}
+
+/// What an estimate can be traced back to.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct PredictionProvenance {
+    /// SHA-256 over the model's files.
+    pub model_sha256: String,
+    /// SHA-256 of the data set's `SHA256SUMS`.
+    pub dataset_sha256: String,
+    /// Version of hydroflex that simulated the data set; absent where the data set does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub simulator_version: Option<String>,
+    /// Version of hydroflex that trained the model.
+    pub trained_by_version: String,
 }

@@ -30,7 +30,6 @@ pub struct FieldError {
     pub pointer: String,
     /// The value as sent, where it could be read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Object)]
     pub value: Option<serde_json::Value>,
     /// What is wrong with it.
     pub detail: String,

@@ -7,7 +7,7 @@ use std::fmt;
 use std::str::FromStr;
 use utoipa::ToSchema;
 
-/// Where a job is in its life. It only ever moves down this list.
+/// Where a job is in its life. It only ever moves down this list, unless it is asked to do again what failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
@@ -149,6 +149,8 @@ pub struct TimeSplit {
     pub encode_s: f64,
     /// Writing to the store.
     pub put_s: f64,
+    /// Waiting for the ledger and for the next shard, from one shard of the job to the next.
+    pub wait_s: f64,
 }
 
 /// A list of jobs, newest first.

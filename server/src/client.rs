@@ -9,10 +9,14 @@ use hydroflex_openapi::status::{JobState, JobStatus, TrainingState};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use reqwest::StatusCode;
 use reqwest::blocking::{Client as Http, RequestBuilder, Response};
+use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
+
+/// Environment variable with the API key; an argument could be read by every user of the machine.
+const KEY: &str = "HYDROFLEX_KEY";
 
 /// How often a job is looked at.
 const POLL: Duration = Duration::from_millis(100);
@@ -36,11 +40,21 @@ impl Client {
         if !(url.starts_with("http://") || url.starts_with("https://")) {
             bail!("the service's address is {url:?}; it must begin with http:// or https://");
         }
-        let http = Http::builder()
+        hydroflex_ledger::tls::ready();
+        let mut http = Http::builder()
             .timeout(None)
-            .connect_timeout(Duration::from_secs(10))
-            .build()
-            .context("cannot set up the HTTP client")?;
+            .connect_timeout(Duration::from_secs(10));
+        if let Ok(key) = std::env::var(KEY) {
+            let mut value = HeaderValue::from_str(&format!("Bearer {key}"))
+                .with_context(|| format!("{KEY} holds no key"))?;
+            value.set_sensitive(true);
+            http = http.default_headers(HeaderMap::from_iter([(AUTHORIZATION, value)]));
+        }
+        if url.starts_with("http://") {
+            // Nobody's certificate is looked at: none need be installed.
+            http = http.tls_certs_only([]);
+        }
+        let http = http.build().context("cannot set up the HTTP client")?;
         Ok(Self {
             base: url.trim_end_matches('/').to_owned(),
             http,
@@ -84,6 +98,19 @@ impl Client {
             .http
             .post(self.url(path))
             .header("content-type", "application/json")
+            .body(body);
+        self.read(request, path)
+    }
+
+    /// Posts a file.
+    ///
+    /// # Errors
+    /// If the service cannot be reached, refuses, or answers something else.
+    pub fn post_bytes<T: DeserializeOwned>(&self, path: &str, body: Vec<u8>) -> anyhow::Result<T> {
+        let request = self
+            .http
+            .post(self.url(path))
+            .header("content-type", "application/octet-stream")
             .body(body);
         self.read(request, path)
     }

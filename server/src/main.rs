@@ -27,9 +27,16 @@ enum Command {
     /// Submit and follow jobs of a running service
     #[command(subcommand)]
     Job(commands::job::Command),
+    /// Replay one run of a job and show it
+    Rerun(commands::rerun::Args),
+    /// Make a data set again from its manifest, and compare the hashes
+    Reproduce(commands::reproduce::Args),
     /// Download data sets from a running service
     #[command(subcommand)]
     Dataset(commands::dataset::Command),
+    /// Make, list and revoke API keys
+    #[command(subcommand)]
+    Key(commands::key::Command),
     /// Train a network on a data set
     Train(commands::train::Args),
     /// Evaluate a model on a data set it has not seen
@@ -52,7 +59,10 @@ fn main() -> std::process::ExitCode {
         Command::Simulate(args) => commands::simulate::run(args),
         Command::Machine(command) => commands::machine::run(command),
         Command::Job(command) => commands::job::run(command),
+        Command::Rerun(args) => commands::rerun::run(args),
+        Command::Reproduce(args) => commands::reproduce::run(args),
         Command::Dataset(command) => commands::dataset::run(command),
+        Command::Key(command) => commands::key::run(command),
         Command::Train(args) => commands::train::run(args),
         Command::Evaluate(args) => commands::evaluate::run(args),
         Command::Model(command) => commands::model::run(command),

@@ -6,6 +6,7 @@ use crate::http::{self, AppState};
 use anyhow::Context;
 use hydroflex_ledger::Ledger;
 use hydroflex_ledger::blobs::Blobs;
+use hydroflex_worker::shard_loop::RunLimits;
 use nix::fcntl::{Flock, FlockArg};
 use std::fs::File;
 use std::net::SocketAddr;
@@ -18,6 +19,9 @@ use tokio_util::sync::CancellationToken;
 /// Time for open requests when the service stops.
 const GRACE: Duration = Duration::from_secs(3);
 
+/// How long a store that is just starting is waited for.
+const PATIENCE: Duration = Duration::from_secs(60);
+
 /// How to run a service.
 #[derive(Debug, Clone)]
 pub struct ServiceConfig {
@@ -27,6 +31,8 @@ pub struct ServiceConfig {
     pub database: Option<String>,
     /// Store URL; a directory below `data` if absent.
     pub store: Option<String>,
+    /// Directory for reduced bodies; below `data` if absent.
+    pub cache: Option<PathBuf>,
     /// Local worker processes.
     pub workers: usize,
     /// The hydroflex binary, from which local processes are started.
@@ -35,6 +41,12 @@ pub struct ServiceConfig {
     pub worker_log: Option<PathBuf>,
     /// Silence after which a worker is given up.
     pub lease: Duration,
+    /// Whether requests need an API key.
+    pub keys: bool,
+    /// Unfinished jobs above which no more are accepted.
+    pub most_jobs: u64,
+    /// What a local worker's run may take.
+    pub limits: RunLimits,
 }
 
 impl ServiceConfig {
@@ -47,10 +59,14 @@ impl ServiceConfig {
             data: data.into(),
             database: None,
             store: None,
+            cache: None,
             workers: cores(),
             executable: std::env::current_exe().context("cannot find the hydroflex binary")?,
             worker_log: None,
             lease: Duration::from_secs(10),
+            keys: false,
+            most_jobs: 1000,
+            limits: RunLimits::default(),
         })
     }
 }
@@ -88,12 +104,15 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         Some(url) => url.clone(),
         None => format!("file://{}", data.join("store").display()),
     };
-    let cache = data.join("cache");
-    std::fs::create_dir_all(&cache).with_context(|| format!("cannot make {}", cache.display()))?;
+    let cache = prepare_directory(&config.cache.unwrap_or_else(|| data.join("cache")))?;
     let ledger = Ledger::create(&database)
         .await
         .context("cannot open the database")?;
     let blobs = Blobs::open(&store).context("cannot open the store")?;
+    blobs
+        .wait_until_there(PATIENCE)
+        .await
+        .context("the store does not answer")?;
     let coordinator = Coordinator::new(
         ledger,
         blobs,
@@ -102,9 +121,13 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
             cache: cache.clone(),
             workers: config.workers,
             lease: config.lease,
+            most_jobs: config.most_jobs,
         },
     );
-    let state = AppState::new(coordinator.clone());
+    let mut state = AppState::new(coordinator.clone());
+    if config.keys {
+        state = state.behind_keys();
+    }
     let stop = CancellationToken::new();
     let supervisor = Supervisor::start(SuperviseConfig {
         executable: config.executable,
@@ -115,15 +138,15 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         trainer_threads: cores(),
         log: config.worker_log,
         longest_stop: 2 * config.lease,
+        limits: config.limits,
     })?;
     let address = listener.local_addr()?;
-    let server = axum::serve(listener, http::router(state.clone()))
-        .with_graceful_shutdown(stop.clone().cancelled_owned());
+    let server = http::serve::serve(listener, http::router(state.clone()), stop.clone());
     Ok(Service {
         address,
         state,
         coordinator: tokio::spawn(coordinator.run(stop.clone())),
-        server: tokio::spawn(server.into_future()),
+        server: tokio::spawn(server),
         stop,
         supervisor,
         _lock: lock,

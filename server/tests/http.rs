@@ -5,7 +5,7 @@ mod common;
 use axum::body::Body;
 use common::Desk;
 use hydroflex_ledger::{NewDataset, NewJob, ShardResult};
-use hydroflex_openapi::catalogue::{DatasetInfo, DatasetPage, FileEntry, MachineList};
+use hydroflex_openapi::catalogue::{DatasetInfo, DatasetPage, FileEntry, MachineList, MeshInfo};
 use hydroflex_openapi::id::DatasetId;
 use hydroflex_openapi::status::{JobPage, JobState, JobStatus, TimeSplit};
 use sha2::{Digest, Sha256};
@@ -35,6 +35,60 @@ async fn a_job_is_accepted_shown_listed_and_cancelled() {
     assert_eq!(cancelled.state, JobState::Cancelled);
     let again = desk.post(&format!("/v1/jobs/{}/cancel", job.job_id), "").await;
     assert_eq!(again.status, 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_mesh_is_uploaded_once_checked_and_named_by_a_job() {
+    let desk = Desk::new().await;
+    // The built-in mesh under a machine file that wants one given.
+    let mesh = include_str!("../../sim/machines/lift-boom/lift-boom.inp");
+    let toml = include_str!("../../sim/machines/lift-boom.toml");
+    let built_in = "mesh = { built_in = \"lift-boom\" }";
+    assert!(toml.contains(built_in));
+    let toml = toml.replace(built_in, "mesh = { given = \"any boom\" }");
+    let job = |meshes: serde_json::Value| {
+        serde_json::json!({"runs": 8, "machine": {"toml": toml}, "meshes": meshes}).to_string()
+    };
+    let missing = desk
+        .post("/v1/jobs", &job(serde_json::json!({})))
+        .await
+        .problem(422);
+    assert!(missing.detail.contains("POST /v1/meshes"), "{}", missing.detail);
+
+    let plain = [("content-type", "text/plain")];
+    let first = desk.send("POST", "/v1/meshes", &plain, mesh).await;
+    assert_eq!(first.status, 201);
+    let info: MeshInfo = first.json();
+    assert_eq!(info.mesh_sha256, hex::encode(Sha256::digest(mesh)));
+    assert_eq!((info.nodes, info.element_kind.as_str()), (14301, "C3D10"));
+    let again = desk.send("POST", "/v1/meshes", &plain, mesh).await;
+    assert_eq!(again.json::<MeshInfo>(), info);
+
+    let accepted = desk
+        .post("/v1/jobs", &job(serde_json::json!({"boom": info.mesh_sha256})))
+        .await;
+    assert_eq!(
+        accepted.status,
+        202,
+        "{}",
+        String::from_utf8_lossy(&accepted.body)
+    );
+    for (body, sha256, pointer) in [
+        ("boom", "0".repeat(64), "/meshes/boom"),
+        ("boom", "../../ledger.sqlite".to_owned(), "/meshes/boom"),
+        ("mast", info.mesh_sha256.clone(), "/machine/toml"),
+    ] {
+        let problem = desk
+            .post("/v1/jobs", &job(serde_json::json!({body: sha256})))
+            .await
+            .problem(422);
+        assert_eq!(problem.errors[0].pointer, pointer);
+    }
+    let broken = desk
+        .send("POST", "/v1/meshes", &plain, mesh.replacen("C3D10", "C3D8", 1))
+        .await;
+    let broken = broken.problem(422);
+    assert!(broken.detail.contains("line"), "{}", broken.detail);
 }
 
 #[tokio::test(flavor = "multi_thread")]

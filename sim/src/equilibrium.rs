@@ -102,6 +102,21 @@ pub fn equilibrium(
     })
 }
 
+/// Eye-to-eye lengths of the cylinders of the undeformed machine at the given angles, m.
+///
+/// # Errors
+/// If the machine cannot be assembled.
+pub(crate) fn start_lengths_m(
+    system: &System,
+    file: &MachineFile,
+    angles_rad: &[f64],
+    ws: &mut Workspace,
+) -> Result<Vec<f64>, EquilibriumError> {
+    let state = assemble(system, file, angles_rad, ws)?;
+    system.evaluate_motion(&state, ws);
+    Ok(ws.cylinders.iter().map(|c| c.length_m).collect())
+}
+
 /// Angle of a frame about global Z, in (−π, π].
 #[must_use]
 pub fn angle_about_z(rotation: &Matrix3<f64>) -> f64 {
@@ -109,7 +124,7 @@ pub fn angle_about_z(rotation: &Matrix3<f64>) -> f64 {
 }
 
 /// `−A₁ Δp₁ + A₂ Δp₂ = lock`, with Δp₂ = 0 where that is possible.
-fn holding_pressures(cylinder: &crate::hydraulics::cylinder::Cylinder, lock_n: f64) -> [f64; 2] {
+pub(crate) fn holding_pressures(cylinder: &crate::hydraulics::cylinder::Cylinder, lock_n: f64) -> [f64; 2] {
     let spec = cylinder.spec();
     let (start, supply, tank) = (
         spec.initial_pressure_pa,

@@ -11,6 +11,7 @@ pub mod system;
 pub mod integrate;
 pub mod equilibrium;
 pub mod fast;
+pub mod tree;
 pub mod trajectory;
 pub mod linearise;
 mod general;

@@ -16,7 +16,7 @@ pub mod validate;
 use crate::trajectory::RunInput;
 use hydroflex_openapi::dataset::SplitName;
 use hydroflex_openapi::job::{Excitation, JobSpec, ValueOrRange};
-use hydroflex_openapi::machine::{CylinderSpec, MachineFile};
+use hydroflex_openapi::machine::{AngleSpec, CylinderSpec, InsteadSpec, MachineFile};
 use stream::Stream;
 
 pub use validate::validate;
@@ -38,6 +38,12 @@ pub enum ScenarioError {
         /// Runs of the job.
         runs: u64,
     },
+    /// No configuration was found from which the machine can start.
+    #[error("in {draws} random configurations a cylinder starts outside the lengths it may start at")]
+    OutOfReach {
+        /// Configurations tried.
+        draws: usize,
+    },
     /// The specification gives signals, but not for this cylinder.
     #[error("no valve signal is given for cylinder {cylinder:?}")]
     NoSignal {
@@ -56,11 +62,48 @@ pub enum ScenarioError {
     },
 }
 
+/// Draws of a configuration after which a run is given up. [`reachable_part`] refuses jobs for which so many
+/// could be needed.
+const DRAWS_MOST: usize = 1000;
+
+/// What knows which configurations a machine can start from.
+pub trait Reach {
+    /// Whether every cylinder starts at a length that it may start at.
+    fn can_start(&self, with_payload: bool, angles_rad: &[f64]) -> bool;
+}
+
+/// Every configuration will do.
+#[derive(Debug, Clone, Copy)]
+pub struct Anywhere;
+
+impl Reach for Anywhere {
+    fn can_start(&self, _: bool, _: &[f64]) -> bool {
+        true
+    }
+}
+
+/// Part of the first `draws` runs' first draws from which the machine can start.
+#[must_use]
+pub fn reachable_part(spec: &JobSpec, machine: &MachineFile, reach: &impl Reach, draws: u64) -> f64 {
+    let fits = |&index: &u64| {
+        let seed = run_seed(spec.seed, index);
+        let angles_rad = Draws::new(spec, machine, seed).next_rad();
+        reach.can_start(payload_kg(spec, seed) > 0.0, &angles_rad)
+    };
+    (0..draws).filter(fits).count() as f64 / draws.max(1) as f64
+}
+
 /// Input of the run of this index; its `run_id` is the index.
 ///
 /// # Errors
-/// The index is too large, or a given signal does not fit.
-pub fn plan_run(spec: &JobSpec, machine: &MachineFile, run_index: u64) -> Result<RunInput, ScenarioError> {
+/// The index is too large, a given signal does not fit, or the machine can start from none of the
+/// configurations.
+pub fn plan_run(
+    spec: &JobSpec,
+    machine: &MachineFile,
+    reach: &impl Reach,
+    run_index: u64,
+) -> Result<RunInput, ScenarioError> {
     if run_index >= spec.runs {
         return Err(ScenarioError::Index {
             index: run_index,
@@ -77,7 +120,7 @@ pub fn plan_run(spec: &JobSpec, machine: &MachineFile, run_index: u64) -> Result
     Ok(RunInput {
         run_id: run_index,
         payload_kg: payload_kg(spec, seed),
-        angles_rad: angles_rad(spec, machine, seed),
+        angles_rad: angles_rad(spec, machine, reach, seed)?,
         valves_ratio,
     })
 }
@@ -86,10 +129,11 @@ pub fn plan_run(spec: &JobSpec, machine: &MachineFile, run_index: u64) -> Result
 /// the first part and then shut. Its `run_id` is the index; settling runs count on their own.
 ///
 /// # Errors
-/// The index is too large.
+/// The index is too large, or the machine can start from none of the configurations.
 pub fn plan_settling_run(
     spec: &JobSpec,
     machine: &MachineFile,
+    reach: &impl Reach,
     index: u64,
 ) -> Result<RunInput, ScenarioError> {
     if index >= spec.settling_runs {
@@ -103,7 +147,7 @@ pub fn plan_settling_run(
     Ok(RunInput {
         run_id: index,
         payload_kg: payload_kg(spec, seed),
-        angles_rad: angles_rad(spec, machine, seed),
+        angles_rad: angles_rad(spec, machine, reach, seed)?,
         valves_ratio: vec![signal; machine.cylinders.len()],
     })
 }
@@ -146,14 +190,63 @@ fn payload_kg(spec: &JobSpec, seed: u64) -> f64 {
     }
 }
 
-fn angles_rad(spec: &JobSpec, machine: &MachineFile, seed: u64) -> Vec<f64> {
-    let draw = |angle: &hydroflex_openapi::machine::AngleSpec| {
-        let range = spec.initial_angle_deg.get(&angle.name);
-        let [min, max] = *range.unwrap_or(&angle.range_deg);
-        let mut stream = Stream::new(seed, &format!("angle/{}", angle.name));
-        stream.uniform(min, max).to_radians()
-    };
-    machine.angles.iter().map(draw).collect()
+/// The first configuration that the machine can start from.
+fn angles_rad(
+    spec: &JobSpec,
+    machine: &MachineFile,
+    reach: &impl Reach,
+    seed: u64,
+) -> Result<Vec<f64>, ScenarioError> {
+    let with_payload = payload_kg(spec, seed) > 0.0;
+    let mut draws = Draws::new(spec, machine, seed);
+    for _ in 0..DRAWS_MOST {
+        let angles_rad = draws.next_rad();
+        if reach.can_start(with_payload, &angles_rad) {
+            return Ok(angles_rad);
+        }
+    }
+    Err(ScenarioError::OutOfReach { draws: DRAWS_MOST })
+}
+
+/// Configurations of one run, one after the other: every angle draws from a stream of its own.
+struct Draws<'a> {
+    spec: &'a JobSpec,
+    machine: &'a MachineFile,
+    streams: Vec<Stream>,
+}
+
+impl<'a> Draws<'a> {
+    fn new(spec: &'a JobSpec, machine: &'a MachineFile, seed: u64) -> Self {
+        let stream = |angle: &AngleSpec| Stream::new(seed, &format!("angle/{}", angle.name));
+        Self {
+            spec,
+            machine,
+            streams: machine.angles.iter().map(stream).collect(),
+        }
+    }
+
+    fn next_rad(&mut self) -> Vec<f64> {
+        let angles = &self.machine.angles;
+        let mut drawn_deg: Vec<f64> = Vec::with_capacity(angles.len());
+        for (angle, stream) in angles.iter().zip(&mut self.streams) {
+            let fits = |other: &&InsteadSpec| {
+                let value = angles.iter().zip(&drawn_deg).find(|(a, _)| a.name == other.angle);
+                let [above, most] = other.between_deg;
+                value.is_some_and(|(_, &deg)| deg > above && deg <= most)
+            };
+            // A job's own range counts as it stands.
+            let [min, max] = match self.spec.initial_angle_deg.get(&angle.name) {
+                Some(range) => *range,
+                None => angle
+                    .instead
+                    .iter()
+                    .find(fits)
+                    .map_or(angle.range_deg, |i| i.range_deg),
+            };
+            drawn_deg.push(stream.uniform(min, max));
+        }
+        drawn_deg.into_iter().map(f64::to_radians).collect()
+    }
 }
 
 fn valve_signal(

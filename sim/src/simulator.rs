@@ -7,16 +7,18 @@ use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::job::Integrator;
 use hydroflex_openapi::machine::MachineFile;
 
-use crate::equilibrium::{Equilibrium, equilibrium};
+use crate::equilibrium::{Equilibrium, equilibrium, start_lengths_m};
 use crate::fast::{self, NotPlanar, PlanarModel};
 use crate::general::GeneralRun;
 use crate::integrate::Scheme;
 use crate::linearise::{Actuation, Linearisation, linearise};
 use crate::machine::Machine;
 use crate::reduction::{ReducedBody, ReductionError};
+use crate::scenario::Reach;
 use crate::system::{System, SystemError};
 use crate::trajectory::recorder::Recorder;
 use crate::trajectory::{InputError, RunFailure, RunInput, RunSettings, Trajectory, channels};
+use crate::tree::{self, NotTree, TreeModel};
 
 /// Spectral radius of the generalised-α scheme that runs can ask for.
 const SPECTRAL_RADIUS: f64 = 0.7;
@@ -53,6 +55,7 @@ struct Variant {
     system: System,
     recorder: Recorder,
     planar: Result<PlanarModel, NotPlanar>,
+    tree: Result<TreeModel, NotTree>,
 }
 
 /// Which equations a run with the accurate integrator solves.
@@ -60,8 +63,15 @@ struct Variant {
 pub enum AccuratePath {
     /// Minimal coordinates of a planar machine.
     Planar,
-    /// Redundant coordinates with constraints, for the reason given.
-    General(NotPlanar),
+    /// Free coordinates of a planar tree with loops.
+    Tree,
+    /// Redundant coordinates with constraints, for the reasons given.
+    General {
+        /// Why it is not one planar boom.
+        not_planar: NotPlanar,
+        /// Why it is not a planar tree.
+        not_tree: NotTree,
+    },
 }
 
 impl Simulator {
@@ -126,8 +136,10 @@ impl Simulator {
                     bodies: file.bodies.len(),
                 }),
             };
+            let tree = TreeModel::new(file, &reduced, with_payload);
             Ok(Variant {
                 reduced,
+                tree,
                 system,
                 recorder,
                 planar,
@@ -176,9 +188,14 @@ impl Simulator {
     /// # Errors
     /// As [`Simulator::prepare`].
     pub fn accurate_path(&self, with_payload: bool) -> Result<AccuratePath, SimulatorError> {
-        Ok(match &self.variant(with_payload)?.planar {
-            Ok(_) => AccuratePath::Planar,
-            Err(reason) => AccuratePath::General(reason.clone()),
+        let variant = self.variant(with_payload)?;
+        Ok(match (&variant.planar, &variant.tree) {
+            (Ok(_), _) => AccuratePath::Planar,
+            (_, Ok(_)) => AccuratePath::Tree,
+            (Err(not_planar), Err(not_tree)) => AccuratePath::General {
+                not_planar: not_planar.clone(),
+                not_tree: not_tree.clone(),
+            },
         })
     }
 
@@ -242,6 +259,15 @@ impl Simulator {
             let mut ws = fast::Workspace::default();
             return model.run(input, settings.sample_time_s, fast::TOLERANCE, &mut ws);
         }
+        if let (Integrator::Accurate, Ok(model)) = (settings.integrator, &variant.tree) {
+            let model = model.with_payload_mass(input.payload_kg);
+            return model.run(
+                self.machine.file(),
+                input,
+                settings.sample_time_s,
+                tree::TOLERANCE,
+            );
+        }
         let system = variant.system.with_payload_mass(input.payload_kg);
         let start = equilibrium(
             &system,
@@ -267,6 +293,46 @@ impl Simulator {
             }
             Integrator::Accurate => run.accurate(&self.channels),
         }
+    }
+}
+
+impl Reach for Simulator {
+    /// On the undeformed machine. A configuration whose loops do not close is none to start from.
+    fn can_start(&self, with_payload: bool, angles_rad: &[f64]) -> bool {
+        let file = self.machine.file();
+        let closed_form: Option<Vec<f64>> = file
+            .cylinders
+            .iter()
+            .map(|cylinder| self.machine.start_length_m(cylinder, angles_rad))
+            .collect();
+        let lengths_m = match closed_form {
+            Some(lengths_m) => lengths_m,
+            None => match self
+                .variant(with_payload)
+                .map(|variant| (&variant.tree, &variant.system))
+            {
+                Ok((Ok(tree), _)) => match tree.start_lengths_m(file, angles_rad) {
+                    Ok(lengths_m) => lengths_m,
+                    Err(_) => return false,
+                },
+                Ok((Err(_), system)) => {
+                    match start_lengths_m(system, file, angles_rad, &mut system.new_workspace()) {
+                        Ok(lengths_m) => lengths_m,
+                        Err(_) => return false,
+                    }
+                }
+                // A machine that cannot run is refused elsewhere, with its reason.
+                Err(_) => return true,
+            },
+        };
+        file.cylinders.iter().zip(lengths_m).all(|(cylinder, length_m)| {
+            let whole = [
+                cylinder.closed_length_m,
+                cylinder.closed_length_m + cylinder.stroke_m,
+            ];
+            let [least, most] = cylinder.start_length_m.unwrap_or(whole);
+            (least..=most).contains(&length_m)
+        })
     }
 }
 

@@ -1,10 +1,13 @@
 //! What there is to know about a machine before it moves: for `hydroflex machine show`.
 
 use crate::fe::{assemble_mass, assemble_stiffness};
+use crate::linearise::Actuation;
 use crate::machine::FlexibleBody;
 use crate::reduction::{ReducedBody, ReductionError, clamped_hz, free_free_hz};
 use crate::simulator::{Simulator, SimulatorError};
-use hydroflex_openapi::machine::{BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, PayloadSpec};
+use hydroflex_openapi::machine::{
+    BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, MachineFile, PayloadSpec,
+};
 use nalgebra::{DMatrix, Matrix3, Vector3};
 use serde::Serialize;
 
@@ -45,6 +48,26 @@ pub struct MachineSummary {
     pub cylinder_names: Vec<String>,
     /// Equilibria over the range of angles, for payloads from none to the largest.
     pub equilibria: Vec<EquilibriumRow>,
+    /// Small motions in the middle of the range, valves shut, for the same payloads.
+    pub small_motions: Vec<SmallMotionsRow>,
+}
+
+/// Small motions about a configuration at rest, with the oil that the shut valves hold.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SmallMotionsRow {
+    /// Payload.
+    pub payload_kg: f64,
+    /// Angles as a run table gives them.
+    pub angles_deg: Vec<f64>,
+    /// Decay of the slowest damped motions, 1/s.
+    pub decay_per_s: Vec<f64>,
+    /// Their frequencies, 0 where they do not oscillate.
+    pub frequency_hz: Vec<f64>,
+    /// Time in which the slowest of them has decayed to a hundredth: SLIDE's window from eigenvalues.
+    pub window_s: Option<f64>,
+    /// Why there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
 }
 
 /// A body in numbers; body frame.
@@ -172,6 +195,10 @@ pub fn summarise(simulator: &Simulator) -> Result<MachineSummary, SummaryError> 
         angle_names: file.angles.iter().map(|a| a.name.clone()).collect(),
         cylinder_names: file.cylinders.iter().map(|c| c.name.clone()).collect(),
         equilibria: equilibria(simulator),
+        small_motions: payloads_kg(file)
+            .into_iter()
+            .map(|payload_kg| small_motions(simulator, payload_kg))
+            .collect(),
     })
 }
 
@@ -263,16 +290,64 @@ fn generalised_hz(stiffness: &DMatrix<f64>, mass: &DMatrix<f64>) -> Vec<f64> {
     hz
 }
 
-fn equilibria(simulator: &Simulator) -> Vec<EquilibriumRow> {
-    let file = simulator.machine().file();
-    let payloads = match &file.payload {
+/// Smallest, middle and largest payload.
+#[must_use]
+pub fn payloads_kg(file: &MachineFile) -> Vec<f64> {
+    match &file.payload {
         Some(PayloadSpec { range_kg, .. }) => {
             vec![range_kg[0], 0.5 * (range_kg[0] + range_kg[1]), range_kg[1]]
         }
         None => vec![0.0],
+    }
+}
+
+/// Damped motions shown.
+const SMALL_MOTIONS_COUNT: usize = 5;
+/// Amplitude to which a motion counts as decayed, as in the SLIDE paper.
+const DECAYED: f64 = 0.01;
+
+fn small_motions(simulator: &Simulator, payload_kg: f64) -> SmallMotionsRow {
+    let file = simulator.machine().file();
+    let angles_deg: Vec<f64> = file
+        .angles
+        .iter()
+        .map(|a| 0.5 * (a.range_deg[0] + a.range_deg[1]))
+        .collect();
+    let angles_rad: Vec<f64> = angles_deg.iter().map(|a| a.to_radians()).collect();
+    let shut = Actuation::Oil {
+        valves_ratio: vec![0.0; file.cylinders.len()],
     };
+    let mut row = SmallMotionsRow {
+        payload_kg,
+        angles_deg,
+        decay_per_s: Vec::new(),
+        frequency_hz: Vec::new(),
+        window_s: None,
+        failure: None,
+    };
+    match simulator.linearise(payload_kg, &angles_rad, &shut) {
+        Ok(found) => {
+            // One of every pair.
+            let slowest = found
+                .eigenvalues_per_s
+                .iter()
+                .filter(|s| s.im >= 0.0)
+                .take(SMALL_MOTIONS_COUNT);
+            for s in slowest {
+                row.decay_per_s.push(-s.re);
+                row.frequency_hz.push(s.im / std::f64::consts::TAU);
+            }
+            row.window_s = found.settling_time_s(DECAYED);
+        }
+        Err(failure) => row.failure = Some(failure.to_string()),
+    }
+    row
+}
+
+fn equilibria(simulator: &Simulator) -> Vec<EquilibriumRow> {
+    let file = simulator.machine().file();
     let mut rows = Vec::new();
-    for payload_kg in payloads {
+    for payload_kg in payloads_kg(file) {
         for point in 0..EQUILIBRIUM_POINTS {
             let part = point as f64 / (EQUILIBRIUM_POINTS - 1) as f64;
             let angles_deg: Vec<f64> = file
@@ -345,6 +420,14 @@ mod tests {
             let (shortest, longest) = (0.820, 0.820 + 0.535);
             assert!((shortest..longest).contains(&row.lengths_m[0]), "{row:?}");
         }
+        // the boom swings on its oil, slower with more payload, and every motion decays
+        let light = small_motions(&simulator, 0.0);
+        let heavy = small_motions(&simulator, 200.0);
+        for row in [&light, &heavy] {
+            assert_eq!(row.failure, None);
+            assert!(row.decay_per_s.iter().all(|decay| *decay > 0.0), "{row:?}");
+        }
+        assert!(heavy.window_s.unwrap() > light.window_s.unwrap());
         // more payload, more pressure
         let piston = |row: &EquilibriumRow| row.pressures_piston_pa[0];
         for (light, heavy) in rows.iter().zip(&rows[EQUILIBRIUM_POINTS..]) {

@@ -231,3 +231,107 @@ pub(crate) fn random_state(system: &System, seed: u64) -> State {
     }
     state
 }
+
+/// A crane in the plane: a rigid arm, a flexible boom on it with a second one welded to its end, and two links
+/// that close a loop between arm and boom; two cylinders, payload at the end of all.
+pub(crate) fn closed_crane() -> (MachineFile, Vec<ReducedBody>) {
+    let planar = |name: &str, seed: u64, modes: usize| {
+        let mut cloud = Cloud::new(9, modes, seed);
+        for shape in &mut cloud.shapes {
+            shape.row_mut(2).fill(0.0);
+        }
+        cloud.points_m[0] = Vector3::new(0.9, 0.3, 0.0);
+        let mut body = cloud.reduce(3e6, 2e-3);
+        body.name = name.to_owned();
+        let rotation = &mut body.interfaces[1].rotation;
+        rotation.row_mut(0).fill(0.0);
+        rotation.row_mut(1).fill(0.0);
+        body
+    };
+    let mut file = cloud_file();
+    file.conventions.marker_rotation = MarkerRotation::Exact;
+    let rigid = |name: &str, start_angle_deg: f64| {
+        let mut body = rig().bodies.remove(0);
+        if let BodySpec::Rigid(rigid) = &mut body {
+            name.clone_into(&mut rigid.name);
+            rigid.mass_kg = 9.0;
+            rigid.centre_of_mass_m = [0.3, 0.01, 0.0];
+            rigid.inertia_kg_m2 = [0.1, 0.3, 0.3, 0.0, 0.0, 0.0];
+            rigid.start_angle_deg = start_angle_deg;
+        }
+        body
+    };
+    file.bodies.push(rigid("rocker", 100.0));
+    file.bodies.push(rigid("coupler", 10.0));
+    let point = |body: &str, x: f64, y: f64| Attachment {
+        body: body.to_owned(),
+        interface: None,
+        point_m: Some([x, y, 0.0]),
+    };
+    let interface = |body: &str, name: &str| Attachment {
+        body: body.to_owned(),
+        interface: Some(name.to_owned()),
+        point_m: None,
+    };
+    let joint = |name: &str, kind, from, to| JointSpec {
+        name: name.to_owned(),
+        kind,
+        from,
+        to,
+    };
+    let (revolute, fixed) = (JointKind::Revolute, JointKind::Fixed);
+    file.joints = vec![
+        joint(
+            "pivot",
+            revolute,
+            point("ground", -0.09, 1.4261),
+            point("arm", 0.0, 0.0),
+        ),
+        joint(
+            "boom",
+            revolute,
+            point("arm", 2.5, 0.1),
+            interface("cloud", "root"),
+        ),
+        joint(
+            "rocker",
+            revolute,
+            point("arm", 2.2, 0.0),
+            point("rocker", 0.0, 0.0),
+        ),
+        joint(
+            "coupler",
+            revolute,
+            point("rocker", 0.7, 0.02),
+            point("coupler", 0.0, 0.0),
+        ),
+        joint(
+            "closing",
+            JointKind::PlanarPin,
+            point("coupler", 1.3, 0.0),
+            interface("cloud", "end"),
+        ),
+        joint(
+            "weld",
+            fixed,
+            interface("cloud", "end"),
+            interface("second", "root"),
+        ),
+    ];
+    let mut tilt = file.cylinders[0].clone();
+    file.cylinders[0].base = point("ground", 0.17, 0.386);
+    file.cylinders[0].rod = point("arm", 0.304, -0.083);
+    tilt.name = "tilt".to_owned();
+    tilt.base = point("arm", 1.0, 0.2);
+    tilt.rod = point("rocker", 0.7, 0.02);
+    tilt.closed_length_m = 1.0;
+    file.cylinders.push(tilt);
+    let mut angle = file.angles[0].clone();
+    angle.name = "tilt".to_owned();
+    angle.body = "cloud".to_owned();
+    file.angles.push(angle);
+    if let Some(payload) = &mut file.payload {
+        payload.at = interface("second", "end");
+    }
+    (file, vec![planar("cloud", 5, 4), planar("second", 6, 3)])
+}

@@ -70,3 +70,36 @@ fn the_step_loop_does_not_allocate() {
         assert_eq!(short, long);
     }
 }
+
+/// The same of the accurate integrator, alone and with runs side by side.
+#[test]
+fn the_accurate_step_loop_does_not_allocate() {
+    let simulator = Simulator::new(Machine::load("lift-boom", &[]).unwrap()).unwrap();
+    simulator.prepare(true).unwrap();
+    let settings = RunSettings {
+        integrator: Integrator::Accurate,
+        sample_time_s: 0.005,
+    };
+    for together in [1_u32, 8] {
+        let allocations = |samples: u32| {
+            // Zero crossings, so that steps are cut and rejected too.
+            let inputs: Vec<RunInput> = (0..together)
+                .map(|i| RunInput {
+                    run_id: u64::from(i),
+                    payload_kg: 60.0,
+                    angles_rad: vec![0.1 + 0.05 * f64::from(i)],
+                    valves_ratio: vec![(0..samples).map(|k| (0.7 * f64::from(k + 3 * i)).sin()).collect()],
+                })
+                .collect();
+            let before = COUNT.with(Cell::get);
+            let results = simulator.run_batch(&inputs, &settings);
+            let after = COUNT.with(Cell::get);
+            assert!(results.iter().all(Result::is_ok));
+            after - before
+        };
+        allocations(10);
+        let (short, long) = (allocations(100), allocations(200));
+        assert!(short > 0, "the counter counts");
+        assert_eq!(short, long, "{together} runs together");
+    }
+}

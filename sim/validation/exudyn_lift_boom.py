@@ -155,10 +155,8 @@ class Boom:
             return area_weights(self.x, self.tets, nodes)
         return np.full(len(nodes), 1 / len(nodes))
 
-    def interface(self, payload):
-        """Exudyn's reduced body on substitute nodes: one per interface (weighted mean) and the tip."""
-        if payload in self.reduced:
-            return self.reduced[payload]
+    def fem(self, payload):
+        """Exudyn's finite-element data with Hurty/Craig-Bampton modes."""
         fem = FEMinterface()
         fem.nodes = {"Position": self.x}
         fem.massMatrix, fem.stiffnessMatrix = self.mass.tocsr(), self.stiffness.tocsr()
@@ -166,6 +164,13 @@ class Boom:
         boundary = [self.sets[i["name"]] for i in self.body["interface"] if i.get("boundary", "always") in allowed]
         fem.ComputeHurtyCraigBamptonModes([b.tolist() for b in boundary], self.body["normal_modes"],
                                           useSparseSolver=True, computationMode=HCBstaticModeSelection.RBE2)
+        return fem
+
+    def interface(self, payload):
+        """Exudyn's reduced body on substitute nodes: one per interface (weighted mean) and the tip."""
+        if payload in self.reduced:
+            return self.reduced[payload]
+        fem = self.fem(payload)
         cms = ObjectFFRFreducedOrderInterface(fem)
         basis, position, names = [], [], []
         for i in self.body["interface"]:
@@ -183,6 +188,11 @@ class Boom:
         return self.reduced[payload]
 
 
+    def attachment(self, name, names):
+        """Mesh nodes of the reduced body, and their weights, that stand for an interface or the tip."""
+        return [names.index(name)], [1.0]
+
+
 def friction_force(spec):
     kind = spec["kind"]
     if kind == "brown_mcphee":
@@ -196,7 +206,9 @@ def friction_force(spec):
     return lambda v: 0.0
 
 
-def simulate(boom, run, scheme, step_s, sample_s):
+def simulate(boom, run, scheme, step_s, sample_s, python_spring=True, measure=None):
+    """One run. Without `python_spring`, friction is left out and the spring beside the cylinder is Exudyn's own;
+    `measure` is called with the integration as its argument."""
     machine, payload = boom.machine, run["payload_kg"]
     cylinder, joint = machine["cylinder"][0], machine["joint"][0]
     name, angle_name = cylinder["name"], machine["angle"][0]["name"]
@@ -216,8 +228,16 @@ def simulate(boom, run, scheme, step_s, sample_s):
         massProportionalDamping=damping["mass_factor_per_s"],
         stiffnessProportionalDamping=damping["stiffness_factor_s"])
     body = flexible["oFFRFreducedOrder"]
-    marker = lambda n: mbs.AddMarker(MarkerSuperElementPosition(
-        bodyNumber=body, meshNodeNumbers=[names.index(n)], weightingFactors=[1.0]))
+
+    def marker(n):
+        nodes, weights = boom.attachment(n, names)
+        return mbs.AddMarker(MarkerSuperElementPosition(
+            bodyNumber=body, meshNodeNumbers=nodes, weightingFactors=weights))
+
+    def position(n):
+        nodes, weights = boom.attachment(n, names)
+        return sum(w * np.asarray(cms.xRef)[3 * k:3 * k + 3] for k, w in zip(nodes, weights))
+
     frame = mbs.AddMarker(MarkerNodeRigid(nodeNumber=flexible["nRigidBody"]))
     bearing = mbs.AddMarker(MarkerBodyRigid(bodyNumber=ground, localPosition=pivot.tolist()))
     mbs.AddObject(GenericJoint(markerNumbers=[bearing, frame], constrainedAxes=[1, 1, 1, 1, 1, 0]))
@@ -226,8 +246,7 @@ def simulate(boom, run, scheme, step_s, sample_s):
     rod = marker(cylinder["rod"]["interface"])
     if payload > 0:
         at = machine["payload"]["at"]["interface"]
-        k = names.index(at)
-        place = pivot + RotationMatrixZ(theta) @ cms.xRef[3 * k:3 * k + 3]
+        place = pivot + RotationMatrixZ(theta) @ position(at)
         node = mbs.AddNode(NodePoint(referenceCoordinates=place.tolist()))
         mass = mbs.AddObject(MassPoint(mass=payload, nodeNumber=node))
         point = mbs.AddMarker(MarkerNodePosition(nodeNumber=node))
@@ -258,15 +277,19 @@ def simulate(boom, run, scheme, step_s, sample_s):
         return friction(v) + extra
 
     free = spring["free_length_m"] if spring else 0.001
-    mbs.AddObject(SpringDamper(markerNumbers=[eye, rod], referenceLength=free, springForceUserFunction=parallel))
-    k = names.index(cylinder["rod"]["interface"])
-    length0 = float(np.linalg.norm(pivot + RotationMatrixZ(theta) @ cms.xRef[3 * k:3 * k + 3] - base))
+    if python_spring:
+        mbs.AddObject(SpringDamper(markerNumbers=[eye, rod], referenceLength=free, springForceUserFunction=parallel))
+    elif spring:
+        mbs.AddObject(SpringDamper(markerNumbers=[eye, rod], referenceLength=free,
+                                   stiffness=spring["stiffness_n_per_m"], damping=spring["damping_n_s_per_m"]))
+    tip = position(cylinder["rod"]["interface"])
+    length0 = float(np.linalg.norm(pivot + RotationMatrixZ(theta) @ tip - base))
     lock = mbs.AddObject(DistanceConstraint(markerNumbers=[eye, rod], distance=length0))
 
     store = dict(storeInternal=True, writeToFile=False)
     out = exu.OutputVariableType
     sensors = {
-        "tip": mbs.AddSensor(SensorSuperElement(bodyNumber=body, meshNodeNumber=names.index("tip"),
+        "tip": mbs.AddSensor(SensorSuperElement(bodyNumber=body, meshNodeNumber=boom.attachment("tip", names)[0][0],
                                                 outputVariableType=out.DisplacementLocal, **store)),
     }
     sensors["coordinates"] = mbs.AddSensor(SensorNode(nodeNumber=flexible["nRigidBody"], outputVariableType=out.RotationMatrix, **store))
@@ -321,7 +344,8 @@ def simulate(boom, run, scheme, step_s, sample_s):
     settings.solution.sensors.writePeriod = sample_s
     kind = (exu.DynamicSolverType.TrapezoidalIndex2 if scheme == "trapezoidal-index-2"
             else exu.DynamicSolverType.GeneralizedAlpha)
-    mbs.SolveDynamic(settings, solverType=kind)
+    integrate = lambda: mbs.SolveDynamic(settings, solverType=kind)
+    measure(integrate) if measure else integrate()
     read = lambda s: mbs.GetSensorStoredData(sensors[s])
     rotation, tip, pressure = read("coordinates"), read("tip"), read("pressure")
     # Exudyn reports the rate of the length as a scalar, or as a vector along the cylinder.

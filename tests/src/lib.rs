@@ -1,6 +1,15 @@
 //! Harness of the end-to-end tests: a real service with real worker processes, driven over its REST
 //! interface, killed where and when a story wants it.
 
+#[allow(
+    clippy::missing_panics_doc,
+    clippy::must_use_candidate,
+    reason = "for tests, where a panic is the answer"
+)]
+#[path = "../../server/ledger/tests/servers/mod.rs"]
+pub mod servers;
+pub mod proxy;
+
 use anyhow::{Context, bail, ensure};
 use hydroflex_openapi::status::JobStatus;
 use nix::sys::signal::{Signal, kill};
@@ -115,7 +124,11 @@ impl ServiceUnderTest {
             let said = log.lock().map(|log| log.join("\n")).unwrap_or_default();
             bail!("the service does not serve; it said:\n{said}");
         };
-        let http = reqwest::blocking::Client::builder().timeout(PATIENCE).build()?;
+        hydroflex_ledger::tls::ready();
+        let http = reqwest::blocking::Client::builder()
+            .tls_certs_only([])
+            .timeout(PATIENCE)
+            .build()?;
         Ok(Self {
             child,
             url,
@@ -134,6 +147,11 @@ impl ServiceUnderTest {
     #[must_use]
     pub fn pid(&self) -> u32 {
         self.child.id()
+    }
+
+    /// Whether it runs, stopped or not.
+    pub fn is_running(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
     }
 
     /// What it has said so far.
@@ -181,6 +199,27 @@ impl ServiceUnderTest {
             .send()?
             .error_for_status()?;
         Ok(response.bytes()?.to_vec())
+    }
+
+    /// Asks for the bytes of a path from `first` on, unless they are as `known` says.
+    ///
+    /// # Errors
+    /// If the service does not answer.
+    pub fn get_range(&self, path: &str, first: u64, known: Option<&str>) -> anyhow::Result<Part> {
+        let mut request = self
+            .http
+            .get(format!("{}{path}", self.url))
+            .header("Range", format!("bytes={first}-"));
+        if let Some(known) = known {
+            request = request.header("If-None-Match", known);
+        }
+        let response = request.send()?;
+        let etag = response.headers().get("etag").and_then(|etag| etag.to_str().ok());
+        Ok(Part {
+            status: response.status().as_u16(),
+            etag: etag.unwrap_or_default().to_owned(),
+            body: response.bytes()?.to_vec(),
+        })
     }
 
     /// Posts nothing to a path.
@@ -297,6 +336,108 @@ impl Drop for ServiceUnderTest {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+/// Answer to a request for a part of a file.
+#[derive(Debug)]
+pub struct Part {
+    /// Status.
+    pub status: u16,
+    /// ETag with its quotes.
+    pub etag: String,
+    /// Bytes.
+    pub body: Vec<u8>,
+}
+
+/// Runs a command of the program; returns what it printed.
+///
+/// # Errors
+/// If it fails, with what it said.
+pub fn command(arguments: &[&str]) -> anyhow::Result<String> {
+    let output = Command::new(binary()?)
+        .args(arguments)
+        .stdin(Stdio::null())
+        .output()?;
+    ensure!(
+        output.status.success(),
+        "{arguments:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    Ok(String::from_utf8(output.stdout)?)
+}
+
+/// A worker that nobody supervises, as it runs on another machine; killed when dropped.
+pub struct Pilot(Child);
+
+impl Pilot {
+    /// Starts one.
+    ///
+    /// # Errors
+    /// If the program cannot be started.
+    pub fn start(
+        database: &str,
+        store: &str,
+        cache: &Path,
+        environment: &[(&'static str, String)],
+        arguments: &[&str],
+    ) -> anyhow::Result<Self> {
+        let child = Command::new(binary()?)
+            .args(["worker", "--database", database, "--store", store])
+            .arg("--cache")
+            .arg(cache)
+            .args(arguments)
+            .envs(environment.iter().map(|(name, value)| (name, value)))
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()?;
+        Ok(Self(child))
+    }
+
+    /// Its process.
+    #[must_use]
+    pub fn pid(&self) -> u32 {
+        self.0.id()
+    }
+
+    /// Whether it runs, stopped or not.
+    pub fn is_running(&mut self) -> bool {
+        matches!(self.0.try_wait(), Ok(None))
+    }
+
+    /// Waits until it has ended by itself, and without an error.
+    ///
+    /// # Errors
+    /// If it does not end, or with an error.
+    pub fn wait(mut self) -> anyhow::Result<()> {
+        let start = Instant::now();
+        loop {
+            match self.0.try_wait()? {
+                Some(status) => {
+                    ensure!(status.success(), "the worker ended with {status}");
+                    return Ok(());
+                }
+                None => ensure!(start.elapsed() < PATIENCE, "the worker did not end"),
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Stops it with SIGTERM.
+    ///
+    /// # Errors
+    /// If it does not end, or with an error.
+    pub fn terminate(self) -> anyhow::Result<()> {
+        signal(self.pid(), Signal::SIGTERM)?;
+        self.wait()
+    }
+}
+
+impl Drop for Pilot {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 

@@ -4,6 +4,7 @@
 //! - `run`: one run of a job into calls of the simulator, and back into a record
 //! - `shard`: the runs of a shard, encoded
 //! - `shard_loop`: claims and hands in; heartbeat and shutdown around it
+//! - `memory`: a run that eats more than it may
 //! - `lifetime`: a worker never outlives the process that started it
 //!
 //! Numbers are made on blocking threads only: the async threads keep the heartbeat going.
@@ -12,4 +13,5 @@ pub mod machines;
 pub mod run;
 pub mod shard;
 pub mod shard_loop;
+mod memory;
 pub mod lifetime;

@@ -27,11 +27,11 @@ pub fn plan(
     let file = machine.machine().file();
     let (input, seed) = match kind {
         RunKind::Job => (
-            scenario::plan_run(spec, file, index)?,
+            scenario::plan_run(spec, file, &machine.simulator, index)?,
             scenario::run_seed(spec.seed, index),
         ),
         RunKind::Settling => (
-            scenario::plan_settling_run(spec, file, index)?,
+            scenario::plan_settling_run(spec, file, &machine.simulator, index)?,
             scenario::settling_run_seed(spec.seed, index),
         ),
     };

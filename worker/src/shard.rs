@@ -28,7 +28,7 @@ pub struct EncodedShard {
     pub sha256: String,
     /// Runs without samples.
     pub failed_runs: u64,
-    /// Time spent; `put_s` still to come.
+    /// Time spent; `put_s` and `wait_s` still to come.
     pub spent: TimeSplit,
 }
 
@@ -134,6 +134,19 @@ pub fn make(
         failed_runs,
         spent,
     })
+}
+
+/// Records of some runs, on this thread, as a shard would hold them.
+///
+/// # Errors
+/// See [`ShardFailure`].
+pub fn records(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    runs: &[u64],
+) -> Result<Vec<RunRecord>, ShardFailure> {
+    simulate(spec, machine, kind, runs, &ShardControl::default())
 }
 
 /// Simulates some runs on one thread: together, or one by one if that panics, to name the culprit.

@@ -1,11 +1,13 @@
 //! Claim, simulate, put, commit; and around it the heartbeat, the limits, the end.
 
-use crate::machines::Machines;
+use crate::machines::{Machines, RefusedMachine};
+use crate::memory;
 use crate::shard::{self, EncodedShard, ShardControl, ShardFailure};
 use anyhow::Context;
 use hydroflex_ledger::blobs::{BlobError, Blobs};
 use hydroflex_ledger::crash::crash_point;
 use hydroflex_ledger::{Claim, CommitOutcome, Ledger, LedgerError, ShardResult, identity};
+use hydroflex_openapi::id::JobId;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -35,8 +37,26 @@ pub struct WorkerConfig {
     pub threads: usize,
     /// Stop after this time, once the shard in hand is done.
     pub drain_after: Option<Duration>,
-    /// Time after which a run counts as hung.
-    pub run_limit: Duration,
+    /// What a run may take.
+    pub limits: RunLimits,
+}
+
+/// What a run may take before it counts as lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RunLimits {
+    /// Time.
+    pub time: Duration,
+    /// Memory of the whole process; 0 for no limit.
+    pub memory_bytes: u64,
+}
+
+impl Default for RunLimits {
+    fn default() -> Self {
+        Self {
+            time: Duration::from_secs(600),
+            memory_bytes: 4 << 30,
+        }
+    }
 }
 
 /// Why a worker ended.
@@ -44,8 +64,8 @@ pub struct WorkerConfig {
 pub enum Ended {
     /// Told to, or its time was up.
     Drained,
-    /// A run hung: the process must end, because a thread in it cannot be stopped.
-    Hung,
+    /// A run hangs or eats memory: the process must end, because a thread in it cannot be stopped.
+    Spoiled,
 }
 
 struct Worker {
@@ -53,7 +73,7 @@ struct Worker {
     blobs: Blobs,
     machines: Arc<Machines>,
     pool: Arc<rayon::ThreadPool>,
-    run_limit: Duration,
+    limits: RunLimits,
     stop: watch::Receiver<bool>,
 }
 
@@ -62,6 +82,7 @@ struct Worker {
 /// # Errors
 /// If the database or store cannot be used at all, or threads cannot be started.
 pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::Result<Ended> {
+    memory::limit(config.limits.memory_bytes);
     let Some(ledger) = connect(&config.database, stop.clone()).await? else {
         return Ok(Ended::Drained);
     };
@@ -70,11 +91,16 @@ pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::
         .thread_name(|number| format!("simulate-{number}"))
         .build()
         .context("cannot start the simulation threads")?;
+    let blobs = Blobs::open(&config.store)?;
+    blobs
+        .wait_until_there(PATIENCE)
+        .await
+        .context("the store does not answer")?;
     let worker = Worker {
-        blobs: Blobs::open(&config.store)?,
+        blobs,
         machines: Arc::new(Machines::new(config.cache)),
         pool: Arc::new(pool),
-        run_limit: config.run_limit,
+        limits: config.limits,
         ledger,
         stop,
     };
@@ -136,6 +162,9 @@ impl Worker {
         alive: &AtomicBool,
     ) -> Result<Option<Ended>, LedgerError> {
         let mut idle = Duration::from_millis(20);
+        // The job of the last shard and when its object was there: what passes until the next shard of
+        // the same job is time that the job's worker waits.
+        let mut last: Option<(JobId, Instant)> = None;
         loop {
             if self.told_to_stop() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
                 return Ok(Some(Ended::Drained));
@@ -143,12 +172,23 @@ impl Worker {
             if !alive.load(Ordering::Relaxed) {
                 return Ok(None);
             }
+            let asked = Instant::now();
             match self.ledger.begin_shard(name).await {
                 Ok(Some(claim)) => {
                     crash_point("begin");
                     idle = Duration::from_millis(20);
-                    if self.do_shard(&claim).await? {
-                        return Ok(Some(Ended::Hung));
+                    let since = match last {
+                        Some((job, at)) if job == claim.job.id => at,
+                        _ => asked,
+                    };
+                    let mut work = Work {
+                        wait_s: since.elapsed().as_secs_f64(),
+                        ended: None,
+                    };
+                    let spoiled = self.do_shard(&claim, &mut work).await?;
+                    last = work.ended.map(|at| (claim.job.id, at));
+                    if spoiled {
+                        return Ok(Some(Ended::Spoiled));
                     }
                 }
                 Ok(None) => {
@@ -172,30 +212,27 @@ impl Worker {
         *self.stop.borrow()
     }
 
-    /// Does one shard, or gives it back with the reason. True if a run hangs in this process.
-    async fn do_shard(&self, claim: &Claim) -> Result<bool, LedgerError> {
+    /// Does one shard, or gives it back with the reason. True if this process is spoiled.
+    async fn do_shard(&self, claim: &Claim, work: &mut Work) -> Result<bool, LedgerError> {
         let shard = &claim.shard;
         let span = tracing::info_span!(
             "shard", job = %shard.job_id, kind = %shard.kind, first_run = shard.first_run, runs = shard.run_count,
             attempt = shard.attempt
         );
-        self.do_shard_in(claim).instrument(span).await
+        self.do_shard_in(claim, work).instrument(span).await
     }
 
-    async fn do_shard_in(&self, claim: &Claim) -> Result<bool, LedgerError> {
+    async fn do_shard_in(&self, claim: &Claim, work: &mut Work) -> Result<bool, LedgerError> {
         let shard = &claim.shard;
         tracing::debug!("begun");
         match self.simulate(claim).await {
-            Simulated::Done(encoded) => self.hand_in(claim, encoded).await?,
+            Simulated::Done(encoded) => self.hand_in(claim, encoded, work).await?,
             Simulated::Stopped => {
                 self.ledger.release_shard(claim).await?;
             }
             Simulated::Fenced => tracing::debug!("no longer wanted"),
-            Simulated::Hung { runs_done } => {
-                let reason = format!(
-                    "a run took longer than {} s, after {runs_done} runs of the shard",
-                    self.run_limit.as_secs_f64()
-                );
+            Simulated::Spoiled { reason } => {
+                tracing::error!(reason, "attempt lost, and this process with it");
                 self.ledger.lose_shard(shard.id, shard.epoch, &reason).await?;
                 return Ok(true);
             }
@@ -215,10 +252,13 @@ impl Worker {
         let control = Arc::new(ShardControl::default());
         let mut work = tokio::task::spawn_blocking({
             let (claim, control) = (claim.clone(), control.clone());
-            let (machines, pool) = (self.machines.clone(), self.pool.clone());
+            let (machines, pool, blobs) = (self.machines.clone(), self.pool.clone(), self.blobs.clone());
             move || {
-                let machine = match machines.ready(&claim.job.spec) {
+                let machine = match machines.ready(&claim.job.spec, &blobs) {
                     Ok(machine) => machine,
+                    Err(refused @ RefusedMachine::Store { .. }) => {
+                        return Err(Simulated::Lost(refused.to_string()));
+                    }
                     Err(refused) => return Err(Simulated::Impossible(refused.to_string())),
                 };
                 if machine.sha256 != claim.job.machine_sha256 {
@@ -253,6 +293,14 @@ impl Worker {
                     drop(told);
                     control.stop.store(true, Ordering::Relaxed);
                 }
+                () = memory::exceeded(self.limits.memory_bytes) => {
+                    let runs_done = control.runs_done.load(Ordering::Relaxed);
+                    let reason = format!(
+                        "a run took more than {} MiB of memory, after {runs_done} runs of the shard",
+                        self.limits.memory_bytes >> 20
+                    );
+                    return Simulated::Spoiled { reason };
+                }
                 () = tokio::time::sleep(LOOK) => {
                     // If the database does not answer, the work goes on: the commit decides.
                     if let Ok(false) = self.ledger.holds(claim).await {
@@ -262,8 +310,12 @@ impl Worker {
                     let runs_done = control.runs_done.load(Ordering::Relaxed);
                     if runs_done != progress.0 {
                         progress = (runs_done, Instant::now());
-                    } else if progress.1.elapsed() > self.run_limit {
-                        return Simulated::Hung { runs_done };
+                    } else if progress.1.elapsed() > self.limits.time {
+                        let reason = format!(
+                            "a run took longer than {} s, after {runs_done} runs of the shard",
+                            self.limits.time.as_secs_f64()
+                        );
+                        return Simulated::Spoiled { reason };
                     }
                 }
             }
@@ -271,7 +323,12 @@ impl Worker {
     }
 
     /// Puts the object, then commits: in this order, so that what is committed is there.
-    async fn hand_in(&self, claim: &Claim, encoded: EncodedShard) -> Result<(), LedgerError> {
+    async fn hand_in(
+        &self,
+        claim: &Claim,
+        encoded: EncodedShard,
+        work: &mut Work,
+    ) -> Result<(), LedgerError> {
         let object = claim.object();
         let start = Instant::now();
         if let Err(error) = self.put(&object, &encoded).await {
@@ -285,6 +342,8 @@ impl Worker {
         crash_point("put");
         let mut spent = encoded.spent;
         spent.put_s = start.elapsed().as_secs_f64();
+        spent.wait_s = work.wait_s;
+        work.ended = Some(Instant::now());
         let result = ShardResult {
             size_bytes: encoded.content.len() as u64,
             sha256: encoded.sha256,
@@ -336,11 +395,19 @@ impl Worker {
     }
 }
 
+/// A worker's time around a shard.
+struct Work {
+    /// Waited for it.
+    wait_s: f64,
+    /// When its object was in the store.
+    ended: Option<Instant>,
+}
+
 enum Simulated {
     Done(EncodedShard),
     Stopped,
     Fenced,
-    Hung { runs_done: u64 },
+    Spoiled { reason: String },
     Lost(String),
     Impossible(String),
 }

@@ -148,6 +148,8 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
     let window_values = config.window_steps * config.inputs.len();
     let flat = graph.scale_inputs(config, window_values);
     let mut x = graph.cast(&flat, FLOAT);
+    // The skip computes in f64 with what the network sees, as in training.
+    let rounded = graph.cast(&x, DOUBLE);
     for (layer, map) in config.layers.iter().zip(&weights.layers) {
         x = graph.gemm(&layer.name, &x, map);
         for &activation in &layer.activations {
@@ -156,7 +158,7 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
     }
     x = graph.cast(&x, DOUBLE);
     if let Some(skip) = &weights.skip {
-        let linear = graph.skip(config, skip, &flat, window_values);
+        let linear = graph.skip(config, skip, &rounded, window_values);
         x = if config.layers.is_empty() {
             linear
         } else {

@@ -64,24 +64,36 @@ pub fn write_model(
         set_limits(&mut envelope.groups, problem, &auxiliary);
     }
     config.golden = golden(problem, data, &predictor);
+    write_parts(&config, &weights, &auxiliary, out_dir)?;
+    let model = Model::load(out_dir)?;
+    Ok(summary(&model, problem, outcome))
+}
 
+/// Writes the folder of a model, replacing what is there.
+///
+/// # Errors
+/// A file cannot be written.
+pub(crate) fn write_parts(
+    config: &ModelConfig,
+    weights: &Weights,
+    auxiliary: &Auxiliary,
+    out_dir: &Path,
+) -> Result<(), ModelError> {
     let tensors = |source| ModelError::Tensors {
         path: out_dir.to_owned(),
         source,
     };
     let files = [
-        ("README.md", card::card(&config).into_bytes()),
+        ("README.md", card::card(config).into_bytes()),
         ("auxiliary.safetensors", auxiliary.to_file().map_err(tensors)?),
-        ("config.json", to_json(&config)),
-        ("model.onnx", super::onnx::to_onnx(&config, &weights)),
+        ("config.json", to_json(config)),
+        ("model.onnx", super::onnx::to_onnx(config, weights)),
         (
             "model.safetensors",
             weights.to_file(&config.layers).map_err(tensors)?,
         ),
     ];
-    write_folder(out_dir, &files)?;
-    let model = Model::load(out_dir)?;
-    Ok(summary(&model, problem, outcome))
+    write_folder(out_dir, &files)
 }
 
 /// Writes `files` into a fresh folder beside `out_dir`, then puts it in place.

@@ -6,10 +6,12 @@
 
 pub mod kernel;
 pub mod skip;
+pub mod sliding;
+pub mod synthetic;
 
-use crate::model::weights::{Auxiliary, Weights};
+use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
-use hydroflex_openapi::model::{EnvelopeGroup, IntervalTable, ModelConfig};
+use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelConfig};
 use kernel::PackedLayer;
 use skip::SkipKernel;
 
@@ -21,6 +23,8 @@ const BLOCK_ROWS: usize = 48;
 pub struct Predictor {
     steps: usize,
     inputs: Scaling,
+    /// Offset and 1 / scale of every value of one sample row.
+    input_maps: Vec<(f64, f64)>,
     targets: Scaling,
     /// Scaled values at which inputs are held; infinite where they are not.
     limits: Vec<[f64; 2]>,
@@ -42,14 +46,23 @@ struct EnvelopeKernel {
 /// Scratch memory of one thread.
 #[derive(Debug, Clone)]
 pub struct Workspace {
-    /// Windows as the network and as the skip take them.
-    window: Scaled,
-    /// Estimates, scaled.
-    estimates: Vec<f64>,
+    window: Vec<f32>,
+    scaled: Vec<f32>,
     ping: Vec<f32>,
     pong: Vec<f32>,
     skip: Vec<f64>,
     projected: Vec<f32>,
+}
+
+/// Estimates of a recording: row k of every column belongs to sample `first_row + k`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SeriesEstimates {
+    /// First sample with an estimate: window steps − 1.
+    pub first_row: usize,
+    /// One column per target, in the column's unit.
+    pub columns: Vec<Vec<f64>>,
+    /// Whether the window is inside the model's envelope; empty when it has none.
+    pub inside: Vec<bool>,
 }
 
 /// Mean square of the coordinates of each group.
@@ -67,56 +80,67 @@ pub fn group_squares<'a>(
 }
 
 fn scaled_limits(config: &ModelConfig) -> Vec<[f64; 2]> {
-    let scaled = |input: usize, value: f64| {
+    let limits = |input: usize| {
         let channel = &config.inputs[input];
-        (value - channel.offset) / channel.scale
+        config
+            .input_limits
+            .get(input)
+            .map_or([f64::NEG_INFINITY, f64::INFINITY], |limits| {
+                limits.map(|value| (value - channel.offset) / channel.scale)
+            })
     };
-    (0..config.inputs.len())
-        .map(|input| {
-            config
-                .input_limits
-                .get(input)
-                .map_or([f64::NEG_INFINITY, f64::INFINITY], |limits| {
-                    limits.map(|value| scaled(input, value))
-                })
-        })
-        .collect()
+    (0..config.inputs.len()).map(limits).collect()
 }
 
-/// Scaled values in both precisions.
-#[derive(Debug, Clone, Default)]
-struct Scaled {
-    single: Vec<f32>,
-    double: Vec<f64>,
-}
-
-impl Scaled {
-    fn resize(&mut self, values: usize) {
-        self.single.resize(values, 0.0);
-        self.double.resize(values, 0.0);
+/// Layers with nothing between them are one linear map: `W₂ (W₁ x + b₁) + b₂ = (W₂ W₁) x + (W₂ b₁ + b₂)`,
+/// multiplied in f64. Folded where that makes the network smaller.
+fn fold(config: &ModelConfig, weights: &Weights) -> Vec<(Vec<Activation>, LinearWeights)> {
+    let mut folded: Vec<(Vec<Activation>, LinearWeights)> = Vec::with_capacity(config.layers.len());
+    for (layer, map) in config.layers.iter().zip(&weights.layers) {
+        if let Some((activations, before)) = folded.last_mut()
+            && activations.is_empty()
+        {
+            let (inner, outputs) = (before.bias.len(), map.bias.len());
+            let inputs = before.weight.len() / inner;
+            if inputs * outputs <= inputs * inner + inner * outputs {
+                *before = compose(before, map, inputs);
+                activations.clone_from(&layer.activations);
+                continue;
+            }
+        }
+        folded.push((layer.activations.clone(), map.clone()));
     }
+    folded
 }
 
-/// Estimates of a recording: row k of every column belongs to sample `first_row + k`.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SeriesEstimates {
-    /// First sample with an estimate: window steps − 1.
-    pub first_row: usize,
-    /// One column per target, in the column's unit.
-    pub columns: Vec<Vec<f64>>,
-    /// Whether the window is inside the model's envelope; empty when it has none.
-    pub inside: Vec<bool>,
+#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+fn compose(first: &LinearWeights, second: &LinearWeights, inputs: usize) -> LinearWeights {
+    let inner = first.bias.len();
+    let mut weight = Vec::with_capacity(second.bias.len() * inputs);
+    let mut bias = Vec::with_capacity(second.bias.len());
+    for (row, &offset) in second.weight.chunks_exact(inner).zip(&second.bias) {
+        let mut sums = vec![0.0_f64; inputs];
+        let mut constant = f64::from(offset);
+        for ((&factor, from), &b) in row.iter().zip(first.weight.chunks_exact(inputs)).zip(&first.bias) {
+            let factor = f64::from(factor);
+            constant += factor * f64::from(b);
+            for (sum, &w) in sums.iter_mut().zip(from) {
+                *sum += factor * f64::from(w);
+            }
+        }
+        weight.extend(sums.into_iter().map(|sum| sum as f32));
+        bias.push(constant as f32);
+    }
+    LinearWeights { weight, bias }
 }
 
 impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let layers = config
-            .layers
+        let layers = fold(config, weights)
             .iter()
-            .zip(&weights.layers)
-            .map(|(layer, map)| PackedLayer::new(map, &layer.activations))
+            .map(|(activations, map)| PackedLayer::new(map, activations))
             .collect();
         let skip = weights.skip.as_ref().map(|map| {
             SkipKernel::new(
@@ -139,6 +163,11 @@ impl Predictor {
         Self {
             steps: config.window_steps,
             inputs: Scaling::from_config(&config.inputs),
+            input_maps: config
+                .inputs
+                .iter()
+                .map(|channel| (channel.offset, channel.scale.recip()))
+                .collect(),
             targets: Scaling::from_config(&config.targets),
             limits: scaled_limits(config),
             layers,
@@ -189,8 +218,8 @@ impl Predictor {
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
         Workspace {
-            window: Scaled::default(),
-            estimates: vec![0.0; BLOCK_ROWS * self.targets.len()],
+            window: vec![0.0; BLOCK_ROWS * self.window_len()],
+            scaled: vec![0.0; BLOCK_ROWS * self.targets.len()],
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
             skip: vec![0.0; BLOCK_ROWS * self.skip.as_ref().map_or(0, SkipKernel::padded)],
@@ -210,13 +239,7 @@ impl Predictor {
     /// When a slice has another length.
     pub fn predict_window(&self, window: &[f64], out: &mut [f64], workspace: &mut Workspace) {
         assert_eq!(window.len(), self.window_len(), "values of a window");
-        assert_eq!(out.len(), self.targets.len(), "one estimate per target");
-        let mut scaled = std::mem::take(&mut workspace.window);
-        scaled.resize(window.len());
-        self.scale_rows(window, &mut scaled);
-        self.block(&scaled, 0, window.len(), 1, workspace);
-        workspace.window = scaled;
-        self.unscale(1, out, workspace);
+        self.predict_windows(window, out, workspace);
     }
 
     /// Estimates for windows that stand one after the other, each as in [`Self::predict_window`];
@@ -224,26 +247,79 @@ impl Predictor {
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn predict_windows(&self, windows: &[f64], out: &mut [f64], workspace: &mut Workspace) {
+    pub fn predict_windows<T: Copy + Into<f64>>(
+        &self,
+        windows: &[T],
+        out: &mut [f64],
+        workspace: &mut Workspace,
+    ) {
+        self.predict_windows_with(windows, out, None, workspace);
+    }
+
+    /// As [`Self::predict_windows`], and for each window whether it is inside the envelope, if
+    /// asked for; every window is inside when the model has none.
+    ///
+    /// # Panics
+    /// When a slice has another length.
+    pub fn predict_windows_with<T: Copy + Into<f64>>(
+        &self,
+        windows: &[T],
+        out: &mut [f64],
+        mut inside: Option<&mut [bool]>,
+        workspace: &mut Workspace,
+    ) {
         let size = self.window_len();
+        let targets = self.targets.len();
         assert_eq!(windows.len() % size, 0, "whole windows");
-        assert_eq!(
-            out.len(),
-            windows.len() / size * self.targets.len(),
-            "one row of estimates per window"
+        let count = windows.len() / size;
+        assert_eq!(out.len(), count * targets, "one row of estimates per window");
+        assert!(
+            inside.as_ref().is_none_or(|inside| inside.len() == count),
+            "one flag per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
-        scaled.resize(BLOCK_ROWS * size);
-        for (block, estimates) in windows
-            .chunks(BLOCK_ROWS * size)
-            .zip(out.chunks_mut(BLOCK_ROWS * self.targets.len()))
-        {
-            self.scale_rows(block, &mut scaled);
-            let rows = block.len() / size;
-            self.block(&scaled, 0, size, rows, workspace);
-            self.unscale(rows, estimates, workspace);
+        for (block, samples) in windows.chunks(BLOCK_ROWS * size).enumerate() {
+            let rows = samples.len() / size;
+            let first = block * BLOCK_ROWS;
+            self.scale_rows(samples, &mut scaled);
+            self.block(&scaled, size, rows, workspace);
+            self.unscale(
+                rows,
+                &mut out[first * targets..(first + rows) * targets],
+                workspace,
+            );
+            if let Some(inside) = inside.as_deref_mut() {
+                let inside = &mut inside[first..first + rows];
+                self.inside_block(&scaled, size, rows, inside, workspace);
+                for (flag, window) in inside.iter_mut().zip(samples.chunks_exact(size)) {
+                    *flag &= self.in_range(window);
+                }
+            }
         }
         workspace.window = scaled;
+    }
+
+    /// Scaled estimates for windows of scaled values that begin `stride` values apart: the network
+    /// alone. `out` has one row of targets per window.
+    ///
+    /// # Panics
+    /// When a slice has another length.
+    pub fn predict_scaled(
+        &self,
+        scaled: &[f32],
+        stride: usize,
+        rows: usize,
+        out: &mut [f32],
+        workspace: &mut Workspace,
+    ) {
+        let targets = self.targets.len();
+        assert_eq!(out.len(), rows * targets, "one row of estimates per window");
+        for first in (0..rows).step_by(BLOCK_ROWS) {
+            let block = BLOCK_ROWS.min(rows - first);
+            self.block(&scaled[first * stride..], stride, block, workspace);
+            out[first * targets..(first + block) * targets]
+                .copy_from_slice(&workspace.scaled[..block * targets]);
+        }
     }
 
     /// Estimates for a recording, the window sliding by one sample: one column of equal length per
@@ -267,28 +343,35 @@ impl Predictor {
         let rows = columns[0].len();
         assert!(columns.iter().all(|c| c.len() == rows), "columns of one length");
         let width = self.inputs.len();
-        let mut scaled = Scaled::default();
-        scaled.resize(rows * width);
-        for (channel, column) in columns.iter().enumerate() {
-            for (row, &value) in column.iter().enumerate() {
-                self.scale_value(channel, value, &mut scaled, row * width + channel);
+        let mut scaled = vec![0.0_f32; rows * width];
+        for (channel, (column, (offset, inverse))) in columns.iter().zip(&self.input_maps).enumerate() {
+            let slots = scaled.iter_mut().skip(channel).step_by(width);
+            for (value, slot) in column.iter().zip(slots) {
+                #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+                {
+                    *slot = ((value - offset) * inverse)
+                        .clamp(self.limits[channel][0], self.limits[channel][1])
+                        as f32;
+                }
             }
         }
         let count = (rows + 1).saturating_sub(self.steps);
         let targets = self.targets.len();
         let mut estimates = vec![Vec::with_capacity(count); targets];
-        let mut inside = Vec::with_capacity(if self.envelope.is_some() { count } else { 0 });
+        let mut inside = vec![true; if self.envelope.is_some() { count } else { 0 }];
         let mut first = 0;
         while first < count {
             let block = BLOCK_ROWS.min(count - first);
-            self.block(&scaled, first * width, width, block, workspace);
-            for row in workspace.estimates[..block * targets].chunks(targets) {
+            let x = &scaled[first * width..];
+            self.block(x, width, block, workspace);
+            for row in workspace.scaled[..block * targets].chunks(targets) {
                 for (t, (column, &value)) in estimates.iter_mut().zip(row).enumerate() {
-                    column.push(self.targets.unscale(t, value));
+                    column.push(self.targets.unscale(t, f64::from(value)));
                 }
             }
-            let x = &scaled.single[first * width..];
-            self.inside_block(x, width, block, &mut inside, workspace);
+            if !inside.is_empty() {
+                self.inside_block(x, width, block, &mut inside[first..first + block], workspace);
+            }
             first += block;
         }
         self.outside_range(columns, &mut inside);
@@ -308,40 +391,20 @@ impl Predictor {
         table.half_widths.get(class).copied()
     }
 
-    /// Whether one window (as in [`Self::predict_window`]) is inside the envelope; absent when the
-    /// model has none.
-    pub fn window_inside(&self, window: &[f64], workspace: &mut Workspace) -> Option<bool> {
-        let envelope = self.envelope.as_ref()?;
-        let width = self.inputs.len();
-        let in_range = window.chunks(width).all(|row| {
-            row.iter()
-                .zip(&envelope.min)
-                .zip(&envelope.max)
-                .all(|((v, min), max)| v >= min && v <= max)
-        });
-        let mut scaled = std::mem::take(&mut workspace.window);
-        scaled.resize(window.len());
-        self.scale_rows(window, &mut scaled);
-        let mut inside = Vec::with_capacity(1);
-        self.inside_block(&scaled.single, window.len(), 1, &mut inside, workspace);
-        workspace.window = scaled;
-        Some(in_range && inside == [true])
-    }
-
-    /// Estimates for scaled windows that begin at value `first` and `stride` values apart, one row of
-    /// scaled targets per window in `workspace.estimates`.
-    fn block(&self, scaled: &Scaled, first: usize, stride: usize, rows: usize, workspace: &mut Workspace) {
+    /// Estimates for scaled windows that begin `stride` values apart, one row of scaled targets per
+    /// window in `workspace.scaled`.
+    fn block(&self, x: &[f32], stride: usize, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
         let Workspace {
-            estimates,
+            scaled,
             ping,
             pong,
             skip,
             ..
         } = workspace;
-        let estimates = &mut estimates[..rows * targets];
+        let scaled = &mut scaled[..rows * targets];
         if let Some((layer, others)) = self.layers.split_first() {
-            layer.forward(&scaled.single[first..], stride, rows, ping);
+            layer.forward(x, stride, rows, ping);
             let (mut from, mut to) = (ping, pong);
             let mut width = layer.padded();
             for layer in others {
@@ -349,39 +412,56 @@ impl Predictor {
                 width = layer.padded();
                 std::mem::swap(&mut from, &mut to);
             }
-            for (row, out) in estimates.chunks_mut(targets).enumerate() {
-                for (slot, &value) in out.iter_mut().zip(&from[row * width..]) {
-                    *slot = f64::from(value);
-                }
+            for (row, out) in scaled.chunks_mut(targets).enumerate() {
+                out.copy_from_slice(&from[row * width..][..targets]);
             }
         } else {
-            estimates.fill(0.0);
+            scaled.fill(0.0);
         }
         if let Some(kernel) = &self.skip {
-            kernel.add(&scaled.double[first..], stride, rows, skip, estimates);
+            kernel.add(x, stride, rows, skip, scaled);
         }
     }
 
+    /// Whether each of the windows is near the training windows; ranges are not looked at.
     fn inside_block(
         &self,
         x: &[f32],
         stride: usize,
         rows: usize,
-        inside: &mut Vec<bool>,
+        inside: &mut [bool],
         workspace: &mut Workspace,
     ) {
-        let Some(envelope) = &self.envelope else { return };
+        let Some(envelope) = &self.envelope else {
+            inside.fill(true);
+            return;
+        };
         envelope
             .projection
             .forward(x, stride, rows, &mut workspace.projected);
         let padded = envelope.projection.padded();
-        for row in workspace.projected[..rows * padded].chunks(padded) {
-            inside.push(
-                group_squares(&envelope.groups, row)
-                    .zip(&envelope.groups)
-                    .all(|(square, group)| square <= group.limit),
-            );
+        let rows = workspace.projected[..rows * padded].chunks(padded);
+        for (flag, row) in inside.iter_mut().zip(rows) {
+            *flag = group_squares(&envelope.groups, row)
+                .zip(&envelope.groups)
+                .all(|(square, group)| square <= group.limit);
         }
+    }
+
+    /// Whether every value of these sample rows is in the range of its channel.
+    fn in_range<T: Copy + Into<f64>>(&self, rows: &[T]) -> bool {
+        let Some(envelope) = &self.envelope else {
+            return true;
+        };
+        rows.chunks_exact(self.inputs.len()).all(|row| {
+            row.iter()
+                .zip(&envelope.min)
+                .zip(&envelope.max)
+                .all(|((&value, min), max)| {
+                    let value: f64 = value.into();
+                    value >= *min && value <= *max
+                })
+        })
     }
 
     /// Clears `inside` for every window that holds a value outside its channel's range.
@@ -400,29 +480,26 @@ impl Predictor {
         }
     }
 
-    fn scale_rows(&self, rows: &[f64], out: &mut Scaled) {
-        let width = self.inputs.len();
-        for (position, &value) in rows.iter().enumerate() {
-            self.scale_value(position % width, value, out, position);
-        }
-    }
-
+    /// Scaled copies of sample rows.
     #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-    fn scale_value(&self, channel: usize, value: f64, out: &mut Scaled, position: usize) {
-        let [low, high] = self.limits[channel];
-        let scaled = self.inputs.scale(channel, value).clamp(low, high);
-        out.double[position] = scaled;
-        out.single[position] = scaled as f32;
+    fn scale_rows<T: Copy + Into<f64>>(&self, rows: &[T], out: &mut [f32]) {
+        let width = self.inputs.len();
+        for (row, slots) in rows.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
+            let maps = self.input_maps.iter().zip(&self.limits);
+            for ((&value, slot), ((offset, inverse), [low, high])) in row.iter().zip(slots).zip(maps) {
+                *slot = ((value.into() - offset) * inverse).clamp(*low, *high) as f32;
+            }
+        }
     }
 
     fn unscale(&self, rows: usize, out: &mut [f64], workspace: &Workspace) {
         let targets = self.targets.len();
         for (estimates, row) in out
             .chunks_mut(targets)
-            .zip(workspace.estimates[..rows * targets].chunks(targets))
+            .zip(workspace.scaled[..rows * targets].chunks(targets))
         {
             for (t, (slot, &value)) in estimates.iter_mut().zip(row).enumerate() {
-                *slot = self.targets.unscale(t, value);
+                *slot = self.targets.unscale(t, f64::from(value));
             }
         }
     }

@@ -2,7 +2,8 @@
 //!
 //! Rows of the map are packed into panels of eight, as [`super::kernel`] does in f32; four partial
 //! sums per panel hide the latency of the multiply-adds. f64 because the coefficients are large
-//! and act on small differences of neighbouring samples.
+//! and act on small differences of neighbouring samples; the samples themselves are the scaled f32 values that
+//! the network takes, as in training.
 
 #![allow(
     clippy::inline_always,
@@ -107,7 +108,7 @@ impl SkipKernel {
     ///
     /// # Panics
     /// When a slice is too short.
-    pub fn add(&self, x: &[f64], stride: usize, rows: usize, scratch: &mut [f64], out: &mut [f64]) {
+    pub fn add(&self, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64], out: &mut [f32]) {
         if rows == 0 {
             return;
         }
@@ -130,33 +131,45 @@ impl SkipKernel {
         for row in 0..rows {
             let window = &x[row * stride..];
             let sums = &scratch[row * self.padded()..];
-            for (term, exponents) in self.exponents.iter().enumerate() {
-                let mut factor = 1.0;
-                for (slow, &exponent) in self.slow.iter().zip(exponents) {
-                    let u = (slow.gain * window[slow.position] + slow.shift).clamp(-1.0, 1.0);
-                    factor *= u.powi(exponent);
+            for (t, slot) in out[row * self.targets..(row + 1) * self.targets]
+                .iter_mut()
+                .enumerate()
+            {
+                let mut total = f64::from(*slot);
+                for (term, exponents) in self.exponents.iter().enumerate() {
+                    total += self.factor(window, exponents) * sums[term * self.targets + t];
                 }
-                for t in 0..self.targets {
-                    out[row * self.targets + t] += factor * sums[term * self.targets + t];
+                #[allow(clippy::cast_possible_truncation, reason = "scaled estimates are f32")]
+                {
+                    *slot = total as f32;
                 }
             }
         }
     }
 
+    /// m_t of a window.
+    fn factor(&self, window: &[f32], exponents: &[i32]) -> f64 {
+        let power = |(slow, &exponent): (&SlowSignal, &i32)| {
+            let u = slow.gain * f64::from(window[slow.position]) + slow.shift;
+            u.clamp(-1.0, 1.0).powi(exponent)
+        };
+        self.slow.iter().zip(exponents).map(power).product()
+    }
+
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f,avx512vl,avx2,fma")]
-    fn forward_avx512(&self, x: &[f64], stride: usize, rows: usize, out: &mut [f64]) {
+    fn forward_avx512(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
         self.forward::<true>(x, stride, rows, out);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn forward_avx2(&self, x: &[f64], stride: usize, rows: usize, out: &mut [f64]) {
+    fn forward_avx2(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
         self.forward::<true>(x, stride, rows, out);
     }
 
     #[inline(always)]
-    fn forward<const FMA: bool>(&self, x: &[f64], stride: usize, rows: usize, out: &mut [f64]) {
+    fn forward<const FMA: bool>(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
         let mut row = 0;
         while row + ROWS <= rows {
             self.rows::<ROWS, FMA>(&x[row * stride..], stride, &mut out[row * self.padded()..]);
@@ -170,8 +183,8 @@ impl SkipKernel {
 
     /// R windows. Every sum is made of the same parts in the same order whatever R is.
     #[inline(always)]
-    fn rows<const R: usize, const FMA: bool>(&self, x: &[f64], stride: usize, out: &mut [f64]) {
-        let windows: [&[f64]; R] = std::array::from_fn(|r| &x[r * stride..r * stride + self.inputs]);
+    fn rows<const R: usize, const FMA: bool>(&self, x: &[f32], stride: usize, out: &mut [f64]) {
+        let windows: [&[f32]; R] = std::array::from_fn(|r| &x[r * stride..r * stride + self.inputs]);
         for (panel, weights) in self.panels.chunks(self.inputs.max(1)).enumerate() {
             let mut sums = [[[0.0_f64; LANES]; R]; PARTS];
             let whole = self.inputs - self.inputs % PARTS;
@@ -179,13 +192,13 @@ impl SkipKernel {
                 for part in 0..PARTS {
                     let w = &weights[first + part];
                     for r in 0..R {
-                        multiply_add::<FMA>(&mut sums[part][r], windows[r][first + part], w);
+                        multiply_add::<FMA>(&mut sums[part][r], f64::from(windows[r][first + part]), w);
                     }
                 }
             }
             for i in whole..self.inputs {
                 for r in 0..R {
-                    multiply_add::<FMA>(&mut sums[0][r], windows[r][i], &weights[i]);
+                    multiply_add::<FMA>(&mut sums[0][r], f64::from(windows[r][i]), &weights[i]);
                 }
             }
             for r in 0..R {
@@ -241,7 +254,7 @@ mod tests {
         };
         let channels = [channel(0.0, 1.0), channel(0.3, 1.5)];
         let kernel = SkipKernel::new(&map, Some(&schedule), &channels, targets);
-        let x: Vec<f64> = (300..300 + 7 * 2 + size).map(value).collect();
+        let x: Vec<f32> = (300..300 + 7 * 2 + size).map(|i| value(i) as f32).collect();
         let rows = 8;
         let mut scratch = vec![0.0; rows * kernel.padded()];
         let mut out = vec![1.0; rows * targets];
@@ -249,7 +262,7 @@ mod tests {
         let mut clamped = 0;
         for row in 0..rows {
             let window = &x[row * 2..row * 2 + size];
-            let length = 0.3 + 1.5 * window[size - 1];
+            let length = 0.3 + 1.5 * f64::from(window[size - 1]);
             let u = (length - 0.5) / 0.8;
             clamped += usize::from(u.abs() > 1.0);
             let u = u.clamp(-1.0, 1.0);
@@ -257,13 +270,18 @@ mod tests {
                 let expected: f64 = (0..3)
                     .map(|term| {
                         let r = term * targets + t;
-                        let linear: f64 = (0..size).map(|i| map.weight[r * size + i] * window[i]).sum();
+                        let linear: f64 = (0..size)
+                            .map(|i| map.weight[r * size + i] * f64::from(window[i]))
+                            .sum();
                         u.powi(i32::try_from(term).unwrap()) * (linear + map.bias[r])
                     })
                     .sum::<f64>()
                     + 1.0;
-                // f64 sums of 22 products of size one.
-                assert!((out[row * targets + t] - expected).abs() < 1e-12, "row {row}");
+                // A sum in f64, rounded to f32; it is below ten.
+                assert!(
+                    (f64::from(out[row * targets + t]) - expected).abs() < 1e-6,
+                    "row {row}"
+                );
             }
         }
         assert!(clamped > 0, "the test should leave the range");

@@ -3,8 +3,10 @@
 //! ```text
 //! shards/JOB/…-eEPOCH.parquet   private; created once, never replaced, deleted when the job is over
 //! datasets/ID/…   models/ID/…   addressed by content; visible once the ledger lists them
+//! meshes/SHA256.inp             uploaded, addressed by content
 //! ```
 
+use crate::s3;
 use bytes::Bytes;
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use hydroflex_openapi::catalogue::FileEntry;
@@ -15,15 +17,26 @@ use sha2::{Digest, Sha256};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// Why the store did not answer.
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
     /// The URL names no store that we know.
-    #[error("a store URL begins with file:///, not {scheme:?}")]
+    #[error("a store URL begins with file:/// or s3://, not {scheme:?}")]
     UnknownStore {
         /// Text before the first colon.
         scheme: String,
+    },
+    /// A part of an S3 URL that is not allowed.
+    #[error("a store URL s3://BUCKET/PREFIX has the {what} {value:?}; allowed: {allowed}")]
+    S3Url {
+        /// Which part.
+        what: &'static str,
+        /// As given.
+        value: String,
+        /// What is allowed.
+        allowed: &'static str,
     },
     /// The store refused, or could not be reached.
     #[error("store: {0}")]
@@ -58,11 +71,32 @@ impl BlobError {
         )
     }
 
+    /// True if the same call may succeed later without anybody doing anything.
+    #[must_use]
+    pub fn is_transient(&self) -> bool {
+        match self {
+            Self::Store(error) => matches!(
+                error,
+                object_store::Error::Generic { .. } | object_store::Error::JoinError { .. }
+            ),
+            Self::File { .. } => true,
+            Self::UnknownStore { .. } | Self::S3Url { .. } | Self::Damaged { .. } => false,
+        }
+    }
+
     /// True if a put was refused because the object is there.
     #[must_use]
     pub fn is_already_there(&self) -> bool {
         matches!(self, Self::Store(object_store::Error::AlreadyExists { .. }))
     }
+}
+
+/// Key of an uploaded mesh; nothing for text that is no SHA-256 in lower case, so that no text from
+/// outside becomes a path.
+#[must_use]
+pub fn mesh_key(sha256: &str) -> Option<String> {
+    let hexadecimal = |byte: u8| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte);
+    (sha256.len() == 64 && sha256.bytes().all(hexadecimal)).then(|| format!("meshes/{sha256}.inp"))
 }
 
 /// A place for objects.
@@ -73,11 +107,31 @@ pub struct Blobs {
 }
 
 impl Blobs {
-    /// Opens the store with this URL: `file:///absolute/path` (made if absent).
+    /// Opens the store with this URL: `file:///absolute/path` (made if absent), or
+    /// `s3://BUCKET/PREFIX` with region, endpoint and credentials from the `AWS_…` variables.
     ///
     /// # Errors
     /// Refuses unknown stores; passes on what the file system says.
     pub fn open(url: &str) -> Result<Self, BlobError> {
+        let variables = std::env::vars_os()
+            .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
+        Self::open_with(url, variables)
+    }
+
+    /// As [`Blobs::open`], with these variables in place of the environment's.
+    ///
+    /// # Errors
+    /// As [`Blobs::open`].
+    pub fn open_with(
+        url: &str,
+        variables: impl IntoIterator<Item = (String, String)>,
+    ) -> Result<Self, BlobError> {
+        if let Some(rest) = url.strip_prefix("s3://") {
+            return Ok(Self {
+                store: s3::open(rest, variables)?,
+                root: None,
+            });
+        }
         match url.strip_prefix("file://") {
             Some(path) if path.starts_with('/') => Self::directory(Path::new(path)),
             _ => Err(BlobError::UnknownStore {
@@ -102,6 +156,35 @@ impl Blobs {
         })
     }
 
+    /// Asks the store for anything at all: whether it is there and lets us in.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn ping(&self) -> Result<(), BlobError> {
+        let nothing = Key::from("ping");
+        match self.store.list(Some(&nothing)).try_next().await {
+            Ok(_) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Asks again until the store answers or `patience` is over.
+    ///
+    /// # Errors
+    /// What the store said last; at once if no patience would help.
+    pub async fn wait_until_there(&self, patience: Duration) -> Result<(), BlobError> {
+        let start = Instant::now();
+        loop {
+            match self.ping().await {
+                Err(error) if error.is_transient() && start.elapsed() < patience => {
+                    tracing::debug!(%error, "waiting for the store");
+                }
+                answer => return answer,
+            }
+            tokio::time::sleep(Duration::from_millis(500)).await;
+        }
+    }
+
     /// The directory that holds the objects below a key, if they are files of this machine.
     #[must_use]
     pub fn local_path(&self, key: &str) -> Option<PathBuf> {
@@ -117,10 +200,21 @@ impl Blobs {
             mode: PutMode::Create,
             ..PutOptions::default()
         };
-        self.store
-            .put_opts(&Key::from(key), PutPayload::from_bytes(content), options)
-            .await?;
-        Ok(())
+        let key = Key::from(key);
+        let put = self
+            .store
+            .put_opts(&key, PutPayload::from_bytes(content.clone()), options)
+            .await;
+        match put {
+            Ok(_) => Ok(()),
+            // Some stores know no conditional put (AWS_CONDITIONAL_PUT=disabled). Names of objects are
+            // unique by their epoch, so the condition is a second guard, never the only one.
+            Err(object_store::Error::NotImplemented { .. } | object_store::Error::NotSupported { .. }) => {
+                self.store.put(&key, PutPayload::from_bytes(content)).await?;
+                Ok(())
+            }
+            Err(error) => Err(error.into()),
+        }
     }
 
     /// Puts a local file under a key addressed by content: replacing it changes nothing.
@@ -260,6 +354,21 @@ impl Blobs {
             let _ = std::fs::remove_dir(path);
         }
         Ok(deleted)
+    }
+
+    /// Names of the folders directly below a key.
+    ///
+    /// # Errors
+    /// Passes on what the store says.
+    pub async fn folders(&self, key: &str) -> Result<Vec<String>, BlobError> {
+        let below = self.store.list_with_delimiter(Some(&Key::from(key))).await?;
+        let names = below
+            .common_prefixes
+            .iter()
+            .filter_map(|folder| folder.filename().map(str::to_owned));
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        Ok(names)
     }
 
     /// Keys of the objects below a key.

@@ -2,13 +2,16 @@
 //!
 //! `HYDROFLEX_CRASH_AT=commit` kills the process when it first passes the point `commit`,
 //! `HYDROFLEX_CRASH_AT=commit:3` when it passes it for the third time. With `HYDROFLEX_CRASH_ONCE=FILE`
-//! only one process dies: the first to create that file.
+//! only one process dies: the first to create that file. `HYDROFLEX_CRASH_HOW` says what happens there:
+//! `kill` (default), `hang`, or `eat` memory.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Environment variable that names the point.
 pub const CRASH_AT: &str = "HYDROFLEX_CRASH_AT";
+/// Environment variable that says how to die.
+pub const CRASH_HOW: &str = "HYDROFLEX_CRASH_HOW";
 /// Environment variable that names the marker file.
 pub const CRASH_ONCE: &str = "HYDROFLEX_CRASH_ONCE";
 
@@ -54,6 +57,19 @@ pub fn crash_point(point: &str) {
         return;
     }
     tracing::warn!(point, "dying here because {CRASH_AT} asks for it");
+    match std::env::var(CRASH_HOW).as_deref() {
+        Ok("hang") => loop {
+            std::thread::sleep(std::time::Duration::from_secs(3600));
+        },
+        Ok("eat") => {
+            let mut eaten: Vec<Vec<u8>> = Vec::new();
+            loop {
+                eaten.push(vec![1; 16 << 20]);
+                std::thread::sleep(std::time::Duration::from_millis(5));
+            }
+        }
+        _ => {}
+    }
     // SIGKILL cannot be caught, so no destructor, flush or handler runs: the honest kind of crash.
     let _ = nix::sys::signal::kill(nix::unistd::Pid::this(), nix::sys::signal::Signal::SIGKILL);
 }

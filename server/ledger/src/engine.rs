@@ -55,6 +55,11 @@ impl From<String> for Value {
         Self::Text(Some(value))
     }
 }
+impl From<Option<i64>> for Value {
+    fn from(value: Option<i64>) -> Self {
+        Self::Int(value)
+    }
+}
 impl From<Option<String>> for Value {
     fn from(value: Option<String>) -> Self {
         Self::Text(value)

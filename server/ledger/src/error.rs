@@ -55,6 +55,9 @@ pub enum LedgerError {
         /// Job.
         id: String,
     },
+    /// The operating system has no random numbers.
+    #[error("no random numbers: {0}")]
+    Random(String),
     /// A contract type that JSON cannot hold.
     #[error("cannot write as JSON: {0}")]
     Json(#[from] serde_json::Error),

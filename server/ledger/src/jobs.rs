@@ -7,7 +7,7 @@ use crate::{Ledger, LedgerError, ShardKind, clock, shards};
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::JobSpec;
-use hydroflex_openapi::status::JobState;
+use hydroflex_openapi::status::{JobState, TimeSplit};
 use sha2::{Digest, Sha256};
 
 /// A job as it is accepted: checked, defaults filled in.
@@ -140,7 +140,7 @@ impl Ledger {
         }
         tx.execute(
             "INSERT INTO jobs (id, state, priority, spec, machine_sha256, runs, settling_runs, created_ms) \
-             VALUES ($1, 'queued', 0, $2, $3, $4, $5, $6)",
+             VALUES ($1, 'queued', $7, $2, $3, $4, $5, $6)",
             values![
                 id.to_string(),
                 serde_json::to_string(&new.spec)?,
@@ -148,6 +148,7 @@ impl Ledger {
                 new.spec.runs,
                 new.spec.settling_runs,
                 clock::now_ms(),
+                i64::from(new.spec.priority),
             ],
         )
         .await?;
@@ -164,6 +165,21 @@ impl Ledger {
         shards::plan(&mut tx, id, ShardKind::Runs, 0, &new.run_shards).await?;
         tx.commit().await?;
         Ok(Created::New(id))
+    }
+
+    /// Whether a request with this key has led to something before.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn knows_key(&self, key: &IdempotencyKey) -> Result<bool, LedgerError> {
+        let row = self
+            .pool
+            .row(
+                "SELECT key FROM idempotency_keys WHERE key = $1",
+                values![key.key.as_str()],
+            )
+            .await?;
+        Ok(row.is_some())
     }
 
     /// One job.
@@ -228,6 +244,28 @@ impl Ledger {
             .iter()
             .map(|row| Ok((row.parse("state")?, row.count("n")?)))
             .collect()
+    }
+
+    /// Worker seconds over all jobs, by what they were spent on.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn time_spent(&self) -> Result<TimeSplit, LedgerError> {
+        let row = self
+            .pool
+            .row(
+                "SELECT COALESCE(SUM(simulate_s), 0.0) AS simulate_s, COALESCE(SUM(encode_s), 0.0) AS encode_s, \
+                 COALESCE(SUM(put_s), 0.0) AS put_s, COALESCE(SUM(wait_s), 0.0) AS wait_s FROM jobs",
+                &[],
+            )
+            .await?
+            .ok_or_else(|| LedgerError::corrupt("jobs", "no sums"))?;
+        Ok(TimeSplit {
+            simulate_s: row.real("simulate_s")?,
+            encode_s: row.real("encode_s")?,
+            put_s: row.real("put_s")?,
+            wait_s: row.real("wait_s")?,
+        })
     }
 
     /// Says that every run is accounted for and the data set is being written. True once per job.
@@ -299,7 +337,86 @@ impl Ledger {
         Ok(ended)
     }
 
-    /// Jobs that need their shard objects no longer, at most `limit`.
+    /// Does again what failed of a job that is over, and nothing else: runs that were given up, and then
+    /// the data set and its trainings; or, if every run is there, the trainings that failed. Returns
+    /// whether there was anything to do.
+    ///
+    /// # Errors
+    /// [`LedgerError::NoJob`]; what the database says.
+    pub async fn retry_job(&self, job: JobId) -> Result<bool, LedgerError> {
+        let mut tx = self.pool.begin().await?;
+        let id = job.to_string();
+        // Shards and trainings before the job, as in every other transaction.
+        let given_up = tx
+            .rows(
+                "UPDATE shards SET state = 'open', attempt = 0, worker = NULL WHERE job_id = $1 \
+                 AND state = 'dead' AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND collected = 0 \
+                   AND dataset_id IS NOT NULL AND state IN ('succeeded', 'failed')) RETURNING *",
+                values![id.as_str()],
+            )
+            .await?;
+        let retried = if given_up.is_empty() {
+            let trainings = tx
+                .execute(
+                    "UPDATE trainings SET state = 'open', attempt = 0, worker = NULL, reason = NULL, \
+                     finished_ms = NULL WHERE job_id = $1 AND state = 'failed' \
+                     AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND state = 'failed')",
+                    values![id.as_str()],
+                )
+                .await?;
+            trainings > 0
+                && advance(
+                    &mut tx,
+                    job,
+                    JobState::Training,
+                    None,
+                    // $3 only takes its place: the job is not over any more.
+                    "UPDATE jobs SET state = $2, finished_ms = NULLIF($3, $3), reason = $4 WHERE id = $1 \
+                     AND state = 'failed'",
+                )
+                .await?
+        } else {
+            let (mut runs, mut settling) = (0, 0);
+            for row in &given_up {
+                match row.parse("kind")? {
+                    ShardKind::Runs => runs += row.count("run_count")?,
+                    ShardKind::Settling => settling += row.count("run_count")?,
+                }
+            }
+            // Its trainings learned from the data set without these runs: they stay, and others follow.
+            tx.execute(
+                "UPDATE trainings SET job_id = NULL WHERE job_id = $1",
+                values![id.as_str()],
+            )
+            .await?;
+            tx.execute(
+                "UPDATE jobs SET runs_done = runs_done - $2, runs_failed = runs_failed - $2, \
+                 settling_done = settling_done - $3, finished_ms = NULL WHERE id = $1",
+                values![id.as_str(), runs, settling],
+            )
+            .await?;
+            advance(
+                &mut tx,
+                job,
+                JobState::Simulating,
+                None,
+                "UPDATE jobs SET state = $2, started_ms = $3, reason = $4 WHERE id = $1 \
+                 AND state IN ('succeeded', 'failed')",
+            )
+            .await?
+        };
+        if !retried {
+            return match tx.row(COLUMNS_OF_JOB, values![id.as_str()]).await? {
+                Some(_) => Ok(false),
+                None => Err(LedgerError::NoJob { id }),
+            };
+        }
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    /// Jobs that need their shard objects no longer, at most `limit`. A published job whose runs were
+    /// given up in part keeps them: [`Ledger::retry_job`] adds the rest.
     ///
     /// # Errors
     /// Passes on what the database says.
@@ -307,13 +424,31 @@ impl Ledger {
         self.pool
             .rows(
                 "SELECT id FROM jobs WHERE collected = 0 \
-                 AND state IN ('training', 'succeeded', 'failed', 'cancelled') ORDER BY id LIMIT $1",
+                 AND state IN ('training', 'succeeded', 'failed', 'cancelled') \
+                 AND (state = 'cancelled' OR dataset_id IS NULL OR NOT EXISTS \
+                   (SELECT 1 FROM shards WHERE job_id = jobs.id AND state = 'dead')) ORDER BY id LIMIT $1",
                 values![limit],
             )
             .await?
             .iter()
             .map(|row| row.parse("id"))
             .collect()
+    }
+
+    /// Whether a job's shard objects have been deleted: what is found of it later is an orphan that a
+    /// worker put after it had been given up.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn is_collected(&self, job: JobId) -> Result<bool, LedgerError> {
+        let row = self
+            .pool
+            .row(
+                "SELECT id FROM jobs WHERE id = $1 AND collected = 1",
+                values![job.to_string()],
+            )
+            .await?;
+        Ok(row.is_some())
     }
 
     /// Notes that a job's shard objects are deleted.

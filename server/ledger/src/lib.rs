@@ -5,8 +5,9 @@
 //!
 //! - `transition`: the life of a shard as a pure function
 //! - `engine`: SQLite and PostgreSQL behind one small surface
-//! - `jobs`, `shards`, `workers`, `artefacts`, `events`: what can be done, one transaction each
-//! - `blobs`: objects in a directory or an object store
+//! - `jobs`, `shards`, `workers`, `artefacts`, `aliases`, `events`: what can be done, one transaction each
+//! - `keys`: who may use the REST interface
+//! - `blobs`: objects in a directory, or in S3 (`s3`) over TLS (`tls`)
 //! - `crash`: places where tests let a process die
 //!
 //! Deliberately absent: a queue. Workers claim straight from the table of shards. Also absent: any
@@ -20,12 +21,17 @@ mod jobs;
 mod shards;
 mod workers;
 mod artefacts;
+mod aliases;
 mod events;
+pub mod keys;
 pub mod blobs;
+mod s3;
+pub mod tls;
 pub mod crash;
 pub mod identity;
 pub mod clock;
 
+pub use aliases::{AliasCondition, AliasMove, AliasRecord};
 pub use artefacts::{NewDataset, NewModel, TrainingClaim};
 pub use engine::Engine;
 pub use error::LedgerError;
@@ -37,7 +43,11 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 1] = [include_str!("../migrations/0001_ledger.sql")];
+const SCHEMA: [&str; 3] = [
+    include_str!("../migrations/0001_ledger.sql"),
+    include_str!("../migrations/0002_aliases.sql"),
+    include_str!("../migrations/0003_keys.sql"),
+];
 
 /// The shared record of what is to be done and what is done.
 #[derive(Clone)]

@@ -63,6 +63,7 @@ impl JobRecord {
                 simulate_s: row.real("simulate_s")?,
                 encode_s: row.real("encode_s")?,
                 put_s: row.real("put_s")?,
+                wait_s: row.real("wait_s")?,
             },
         };
         let state: JobState = row.parse("state")?;

@@ -155,13 +155,13 @@ async fn count_runs(
     let statement = match kind {
         ShardKind::Runs => {
             "UPDATE jobs SET runs_done = runs_done + $2, runs_failed = runs_failed + $3, \
-             simulate_s = simulate_s + $4, encode_s = encode_s + $5, put_s = put_s + $6 WHERE id = $1 \
+             simulate_s = simulate_s + $4, encode_s = encode_s + $5, put_s = put_s + $6, wait_s = wait_s + $7 WHERE id = $1 \
              RETURNING runs_done, runs_failed, settling_done"
         }
         // Failed settling runs are not counted: $3 only takes its place among the parameters.
         ShardKind::Settling => {
             "UPDATE jobs SET settling_done = settling_done + $2, runs_failed = runs_failed + 0 * $3, \
-             simulate_s = simulate_s + $4, encode_s = encode_s + $5, put_s = put_s + $6 WHERE id = $1 \
+             simulate_s = simulate_s + $4, encode_s = encode_s + $5, put_s = put_s + $6, wait_s = wait_s + $7 WHERE id = $1 \
              RETURNING runs_done, runs_failed, settling_done"
         }
     };
@@ -174,7 +174,8 @@ async fn count_runs(
                 failed,
                 spent.simulate_s,
                 spent.encode_s,
-                spent.put_s
+                spent.put_s,
+                spent.wait_s,
             ],
         )
         .await?

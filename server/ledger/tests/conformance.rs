@@ -1,7 +1,17 @@
-//! One suite for every engine: what the ledger promises, whatever stands below it.
+//! One suite for every engine and every store: what the ledger and its blobs promise, whatever stands
+//! below them.
 
-mod postgres;
+#[allow(
+    dead_code,
+    unreachable_pub,
+    reason = "shared with the end-to-end tests, which use more of it"
+)]
+mod servers;
 
+use bytes::Bytes;
+use futures::TryStreamExt;
+use hydroflex_ledger::blobs::{BlobError, Blobs};
+use hydroflex_ledger::keys::{self, Scope};
 use hydroflex_ledger::transition::{ATTEMPT_LIMIT, ShardState};
 use hydroflex_ledger::{
     CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, NewJob, NewModel, ShardKind,
@@ -38,6 +48,7 @@ fn result(object: &str) -> ShardResult {
             simulate_s: 0.5,
             encode_s: 0.25,
             put_s: 0.125,
+            wait_s: 0.0625,
         },
     }
 }
@@ -84,7 +95,7 @@ macro_rules! on_every_engine {
             $(
                 #[tokio::test(flavor = "multi_thread")]
                 async fn $name() {
-                    let Some(url) = super::postgres::fresh_database(stringify!($name)) else { return };
+                    let Some(url) = super::servers::postgres::fresh_database(stringify!($name)) else { return };
                     let ledger = hydroflex_ledger::Ledger::create(&url).await.unwrap();
                     super::$name(super::with_workers(ledger).await).await;
                 }
@@ -109,7 +120,279 @@ on_every_engine![
     a_failed_training_fails_its_job_and_keeps_the_data_set,
     many_workers_share_without_overlap,
     pages_of_jobs_are_newest_first,
+    urgent_jobs_go_first,
+    given_up_runs_are_done_again_and_nothing_else,
+    failed_trainings_are_done_again_and_nothing_else,
+    a_key_is_found_by_its_hash_until_it_is_revoked,
 ];
+
+/// A directory, and a bucket of a name of its own; `None` where there is no S3 server.
+fn directory(folder: &tempfile::TempDir) -> Blobs {
+    Blobs::open(&format!("file://{}", folder.path().join("store").display())).unwrap()
+}
+
+fn s3(name: &str) -> Option<Blobs> {
+    let server = servers::moto::shared()?;
+    let bucket: String = format!("b-{}", name.replace('_', "-")).chars().take(60).collect();
+    server.bucket(bucket.trim_end_matches('-'));
+    let variables = servers::moto::environment(server.port())
+        .into_iter()
+        .map(|(name, value)| (name.to_owned(), value));
+    let url = format!("s3://{}/some/prefix", bucket.trim_end_matches('-'));
+    Some(Blobs::open_with(&url, variables).unwrap())
+}
+
+/// Every test of the suite on every store.
+macro_rules! on_every_store {
+    ($($name:ident),* $(,)?) => {
+        mod on_a_directory {
+            $(
+                #[tokio::test(flavor = "multi_thread")]
+                async fn $name() {
+                    let folder = tempfile::tempdir().unwrap();
+                    super::$name(super::directory(&folder)).await;
+                }
+            )*
+        }
+        mod on_s3 {
+            $(
+                #[tokio::test(flavor = "multi_thread")]
+                async fn $name() {
+                    let Some(blobs) = super::s3(stringify!($name)) else { return };
+                    super::$name(blobs).await;
+                }
+            )*
+        }
+    };
+}
+
+on_every_store![
+    a_store_that_is_there_answers,
+    an_object_is_created_once,
+    of_many_creators_one_wins,
+    a_part_of_an_object_is_streamed,
+    a_damaged_or_missing_object_is_a_loss,
+    a_large_file_is_uploaded_in_parts,
+    a_folder_is_there_to_read_as_files,
+    what_is_below_a_key_is_listed_and_deleted_and_nothing_else,
+];
+
+/// Every test of the suite on every pair of engine and store.
+macro_rules! on_every_pair {
+    ($($name:ident),* $(,)?) => {
+        mod on_every_pair {
+            $(
+                #[tokio::test(flavor = "multi_thread")]
+                async fn $name() {
+                    let folder = tempfile::tempdir().unwrap();
+                    let mut ledgers = vec![super::sqlite(&folder).await];
+                    if let Some(url) = super::servers::postgres::fresh_database(concat!("pair_", stringify!($name))) {
+                        let ledger = hydroflex_ledger::Ledger::create(&url).await.unwrap();
+                        ledgers.push(super::with_workers(ledger).await);
+                    }
+                    let mut stores = vec![super::directory(&folder)];
+                    stores.extend(super::s3(concat!("pair-", stringify!($name))));
+                    for ledger in &ledgers {
+                        for blobs in &stores {
+                            super::$name(ledger, blobs).await;
+                        }
+                    }
+                }
+            )*
+        }
+    };
+}
+
+on_every_pair![from_claim_to_collection];
+
+async fn from_claim_to_collection(ledger: &Ledger, blobs: &Blobs) {
+    let id = ledger.create_job(&new_job(&[2, 2, 2]), None).await.unwrap().id();
+    let slow = ledger.begin_shard("a").await.unwrap().unwrap();
+    let content = Bytes::from_static(b"what the slow one made");
+    blobs.create(&slow.object(), content).await.unwrap();
+    ledger
+        .lose_shard(slow.shard.id, slow.shard.epoch, "stopped")
+        .await
+        .unwrap();
+    while let Some(claim) = ledger.begin_shard("b").await.unwrap() {
+        let content = Bytes::from(format!("runs from {}", claim.shard.first_run));
+        let sha256 = sha256(&content);
+        blobs.create(&claim.object(), content).await.unwrap();
+        let result = ShardResult {
+            sha256,
+            ..result(&claim.object())
+        };
+        assert_eq!(
+            ledger.commit_shard(&claim, &result).await.unwrap(),
+            CommitOutcome::Committed
+        );
+    }
+    let late = ledger.commit_shard(&slow, &result(&slow.object())).await.unwrap();
+    assert_eq!(late, CommitOutcome::Fenced);
+    // What is committed is there and whole; the orphan beside it is nobody's.
+    let settled = ledger.settled_shards(id, ShardKind::Runs, 0, 10).await.unwrap();
+    assert_eq!(settled.len(), 3);
+    for shard in &settled {
+        let content = blobs
+            .read(shard.object.as_deref().unwrap(), shard.sha256.as_deref().unwrap())
+            .await
+            .unwrap();
+        assert_eq!(content, format!("runs from {}", shard.first_run));
+    }
+    let below = format!("shards/{id}");
+    assert_eq!(blobs.list(&below).await.unwrap().len(), 4);
+    assert!(ledger.cancel_job(id).await.unwrap());
+    for job in ledger.uncollected_jobs(10).await.unwrap() {
+        blobs.delete_below(&format!("shards/{job}")).await.unwrap();
+        ledger.mark_collected(job).await.unwrap();
+    }
+    assert_eq!(blobs.list(&below).await.unwrap(), Vec::<String>::new());
+}
+
+fn sha256(content: &[u8]) -> String {
+    use sha2::Digest;
+    hex::encode(sha2::Sha256::digest(content))
+}
+
+async fn a_store_that_is_there_answers(blobs: Blobs) {
+    blobs.ping().await.unwrap();
+    blobs
+        .wait_until_there(std::time::Duration::from_secs(1))
+        .await
+        .unwrap();
+}
+
+async fn an_object_is_created_once(blobs: Blobs) {
+    let first = Bytes::from_static(b"first");
+    blobs.create("shards/j/a.parquet", first.clone()).await.unwrap();
+    let second = blobs
+        .create("shards/j/a.parquet", Bytes::from_static(b"second"))
+        .await
+        .unwrap_err();
+    assert!(second.is_already_there() && !second.is_loss(), "{second}");
+    let content = blobs.read("shards/j/a.parquet", &sha256(&first)).await.unwrap();
+    assert_eq!(content, first);
+    blobs.delete("shards/j/a.parquet").await.unwrap();
+    blobs.delete("shards/j/a.parquet").await.unwrap();
+    blobs.create("shards/j/a.parquet", first).await.unwrap();
+}
+
+async fn of_many_creators_one_wins(blobs: Blobs) {
+    let creators = (0..8).map(|number| {
+        let blobs = blobs.clone();
+        tokio::spawn(async move {
+            blobs
+                .create("race", Bytes::from(format!("creator {number}")))
+                .await
+        })
+    });
+    let mut winners = 0;
+    for creator in futures::future::join_all(creators).await {
+        match creator.unwrap() {
+            Ok(()) => winners += 1,
+            Err(error) => assert!(error.is_already_there(), "{error}"),
+        }
+    }
+    assert_eq!(winners, 1);
+}
+
+async fn a_part_of_an_object_is_streamed(blobs: Blobs) {
+    let content: Vec<u8> = (0..=255).cycle().take(100_000).collect();
+    blobs
+        .create("object", Bytes::from(content.clone()))
+        .await
+        .unwrap();
+    for range in [0..100_000, 0..1, 99_999..100_000, 12_345..54_321, 7..7] {
+        let parts: Vec<Bytes> = blobs
+            .stream("object", range.clone())
+            .await
+            .unwrap()
+            .try_collect()
+            .await
+            .unwrap();
+        let (start, end) = (range.start.try_into().unwrap(), range.end.try_into().unwrap());
+        assert_eq!(parts.concat(), &content[start..end], "{range:?}");
+    }
+}
+
+async fn a_damaged_or_missing_object_is_a_loss(blobs: Blobs) {
+    blobs
+        .create("object", Bytes::from_static(b"other"))
+        .await
+        .unwrap();
+    let damaged = blobs.read("object", HASH).await.unwrap_err();
+    assert!(
+        matches!(damaged, BlobError::Damaged { .. }) && damaged.is_loss(),
+        "{damaged}"
+    );
+    let missing = blobs.read("nothing", HASH).await.unwrap_err();
+    assert!(missing.is_loss() && !missing.is_transient(), "{missing}");
+}
+
+async fn a_large_file_is_uploaded_in_parts(blobs: Blobs) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("large");
+    let content: Vec<u8> = (0..20_000_000_u32).map(|index| (index % 251) as u8).collect();
+    std::fs::write(&file, &content).unwrap();
+    // Twice: the same content under the same name.
+    for _ in 0..2 {
+        blobs
+            .upload(&file, "datasets/d/data/large.parquet")
+            .await
+            .unwrap();
+        let read = blobs
+            .read("datasets/d/data/large.parquet", &sha256(&content))
+            .await
+            .unwrap();
+        assert_eq!(read.len(), content.len());
+    }
+    let nothing = blobs
+        .upload(&folder.path().join("absent"), "absent")
+        .await
+        .unwrap_err();
+    assert!(matches!(nothing, BlobError::File { .. }), "{nothing}");
+}
+
+async fn a_folder_is_there_to_read_as_files(blobs: Blobs) {
+    let content = Bytes::from_static(b"read me");
+    blobs
+        .create("datasets/d/README.md", content.clone())
+        .await
+        .unwrap();
+    blobs
+        .create("datasets/d/data/a.parquet", content.clone())
+        .await
+        .unwrap();
+    let files: Vec<FileEntry> = ["README.md", "data/a.parquet"]
+        .iter()
+        .map(|path| FileEntry {
+            path: (*path).to_owned(),
+            size_bytes: content.len() as u64,
+            sha256: sha256(&content),
+        })
+        .collect();
+    let (path, _temporary) = blobs.folder("datasets/d/", &files).await.unwrap();
+    for file in &files {
+        assert_eq!(std::fs::read(path.join(&file.path)).unwrap(), content);
+    }
+}
+
+async fn what_is_below_a_key_is_listed_and_deleted_and_nothing_else(blobs: Blobs) {
+    for key in ["shards/j/a", "shards/j/b", "shards/jj/a", "datasets/j/a"] {
+        blobs.create(key, Bytes::from_static(b"x")).await.unwrap();
+    }
+    assert_eq!(
+        blobs.list("shards/j").await.unwrap(),
+        ["shards/j/a", "shards/j/b"]
+    );
+    assert_eq!(blobs.list("nothing").await.unwrap(), Vec::<String>::new());
+    assert_eq!(blobs.folders("shards").await.unwrap(), ["j", "jj"]);
+    assert_eq!(blobs.folders("shards/j").await.unwrap(), Vec::<String>::new());
+    assert_eq!(blobs.delete_below("shards/j").await.unwrap(), 2);
+    assert_eq!(blobs.delete_below("shards/j").await.unwrap(), 0);
+    assert_eq!(blobs.list("shards").await.unwrap(), ["shards/jj/a"]);
+    assert_eq!(blobs.list("datasets").await.unwrap(), ["datasets/j/a"]);
+}
 
 async fn a_job_its_shards_and_its_event_appear_together(ledger: Ledger) {
     let id = ledger.create_job(&new_job(&[3, 2]), None).await.unwrap().id();
@@ -171,6 +454,9 @@ async fn shards_are_handed_out_once_in_order(ledger: Ledger) {
     assert_eq!(job.progress.runs_done, 5);
     assert_eq!(job.progress.runs_failed, 2);
     assert!((job.progress.spent.simulate_s - 1.5).abs() < 1e-12);
+    let spent = ledger.time_spent().await.unwrap();
+    assert_eq!(spent, job.progress.spent);
+    assert!((spent.wait_s - 3.0 * 0.0625).abs() < 1e-12);
     assert!((ledger.run_cost_s(id).await.unwrap().unwrap() - 1.0 / 5.0).abs() < 1e-12);
     let settled = ledger.settled_shards(id, ShardKind::Runs, 0, 10).await.unwrap();
     assert_eq!(
@@ -552,4 +838,128 @@ async fn pages_of_jobs_are_newest_first(ledger: Ledger) {
         .map(|job| job.id)
         .collect();
     assert_eq!(rest, ids[3..]);
+}
+
+async fn urgent_jobs_go_first(ledger: Ledger) {
+    let mut ids = Vec::new();
+    for priority in [-1, 0, 5, 0] {
+        let mut new = new_job(&[1]);
+        new.spec.priority = priority;
+        ids.push(ledger.create_job(&new, None).await.unwrap().id());
+    }
+    let mut begun = Vec::new();
+    while let Some(claim) = ledger.begin_shard("a").await.unwrap() {
+        begun.push(claim.job.id);
+    }
+    assert_eq!(begun, [ids[2], ids[1], ids[3], ids[0]]);
+}
+
+async fn a_key_is_found_by_its_hash_until_it_is_revoked(ledger: Ledger) {
+    let scopes = [Scope::Submit, Scope::Read];
+    let (key, record) = ledger.create_key("night shift", &scopes, Some(5)).await.unwrap();
+    let (other, _) = ledger.create_key("other", &[Scope::Admin], None).await.unwrap();
+    // A prefix and 256 bits.
+    assert_eq!(key.len(), 4 + 64);
+    assert_ne!(key, other);
+    let found = ledger.key(&keys::hash(&key)).await.unwrap().unwrap();
+    assert_eq!(found, record);
+    assert_eq!(
+        (found.title.as_str(), found.scopes.as_slice()),
+        ("night shift", scopes.as_slice())
+    );
+    assert!(ledger.key(&keys::hash("hfx_guess")).await.unwrap().is_none());
+    assert!(ledger.revoke_key(record.id).await.unwrap());
+    assert!(!ledger.revoke_key(record.id).await.unwrap());
+    let listed = ledger.keys().await.unwrap();
+    assert_eq!(listed.len(), 2);
+    assert!(listed[0].revoked_ms.is_some() && listed[1].revoked_ms.is_none());
+}
+
+async fn given_up_runs_are_done_again_and_nothing_else(ledger: Ledger) {
+    const BAD: u64 = 2;
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    while let Some(claim) = ledger.begin_shard("a").await.unwrap() {
+        let runs = claim.shard.first_run..claim.shard.first_run + claim.shard.run_count;
+        if runs.contains(&BAD) {
+            ledger
+                .lose_shard(claim.shard.id, claim.shard.epoch, "boom")
+                .await
+                .unwrap();
+        } else {
+            let result = ShardResult {
+                failed_runs: 0,
+                ..result(&claim.object())
+            };
+            ledger.commit_shard(&claim, &result).await.unwrap();
+        }
+    }
+    assert!(!ledger.retry_job(id).await.unwrap(), "not over yet");
+    assert!(ledger.begin_publishing(id).await.unwrap());
+    ledger
+        .publish_dataset(id, &new_dataset(), &[TrainingSpec::default()])
+        .await
+        .unwrap();
+    let training = ledger.begin_training("a").await.unwrap().unwrap();
+    ledger.fail_training(&training, "no").await.unwrap();
+    assert_eq!(ledger.job(id).await.unwrap().unwrap().state, JobState::Failed);
+    // What its other runs made is kept for this.
+    assert!(ledger.uncollected_jobs(10).await.unwrap().is_empty());
+
+    assert!(ledger.retry_job(id).await.unwrap());
+    assert!(!ledger.retry_job(id).await.unwrap(), "in work already");
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(
+        (
+            job.state,
+            job.progress.runs_done,
+            job.progress.runs_failed,
+            job.reason
+        ),
+        (JobState::Simulating, 3, 0, None)
+    );
+    let claim = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert_eq!((claim.shard.first_run, claim.shard.run_count), (BAD, 1));
+    assert!(ledger.begin_shard("b").await.unwrap().is_none());
+    let done = ShardResult {
+        failed_runs: 0,
+        ..result(&claim.object())
+    };
+    ledger.commit_shard(&claim, &done).await.unwrap();
+    assert!(ledger.begin_publishing(id).await.unwrap());
+    ledger
+        .publish_dataset(id, &new_dataset(), &[TrainingSpec::default()])
+        .await
+        .unwrap();
+    let trainings = ledger.trainings_of(id).await.unwrap();
+    assert_eq!(trainings.len(), 1, "the one for the old data set is not counted");
+    assert_eq!(trainings[0].state, TrainingState::Open);
+    assert_eq!(ledger.uncollected_jobs(10).await.unwrap(), [id]);
+    let missing = ledger.retry_job(JobId::generate()).await;
+    assert!(matches!(missing, Err(LedgerError::NoJob { .. })), "{missing:?}");
+}
+
+async fn failed_trainings_are_done_again_and_nothing_else(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    finish_runs(&ledger, id).await;
+    let specs = [TrainingSpec::default(), TrainingSpec::default()];
+    ledger.publish_dataset(id, &new_dataset(), &specs).await.unwrap();
+    let good = ledger.begin_training("a").await.unwrap().unwrap();
+    let model = NewModel {
+        id: ModelId::of_sha256(HASH).unwrap(),
+        sha256: HASH.to_owned(),
+        metrics: serde_json::json!({}),
+        files: Vec::new(),
+    };
+    assert!(ledger.commit_training(&good, &model).await.unwrap());
+    let bad = ledger.begin_training("a").await.unwrap().unwrap();
+    ledger.fail_training(&bad, "no").await.unwrap();
+    assert!(ledger.retry_job(id).await.unwrap());
+    let again = ledger.begin_training("a").await.unwrap().unwrap();
+    assert_eq!((again.training.id, again.training.attempt), (bad.training.id, 1));
+    assert!(ledger.begin_training("a").await.unwrap().is_none());
+    assert!(ledger.begin_shard("a").await.unwrap().is_none());
+    assert!(ledger.commit_training(&again, &model).await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(job.state, JobState::Succeeded);
+    assert!(!ledger.retry_job(id).await.unwrap());
 }

@@ -2,6 +2,7 @@
 
 use crate::client::Client;
 use anyhow::Context;
+use hydroflex_openapi::catalogue::MeshInfo;
 use hydroflex_openapi::status::{JobPage, JobState, JobStatus};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -24,6 +25,9 @@ pub enum Command {
     Submit {
         /// Job as JSON
         file: PathBuf,
+        /// BODY=FILE: upload this Abaqus mesh and give it to the job's machine; may be repeated
+        #[arg(long, value_parser = mesh_of_body)]
+        mesh: Vec<(String, PathBuf)>,
         /// Wait until the data set is published and the networks are trained
         #[arg(long)]
         wait: bool,
@@ -53,6 +57,17 @@ pub enum Command {
         #[command(flatten)]
         service: ServiceArgs,
     },
+    /// Do again what failed of a job that is over: given-up runs, or failed trainings
+    Retry {
+        /// Job id
+        job: String,
+        /// Wait until it is over
+        #[arg(long)]
+        wait: bool,
+        /// Service
+        #[command(flatten)]
+        service: ServiceArgs,
+    },
     /// Cancel a job
     Cancel {
         /// Job id
@@ -69,13 +84,26 @@ pub enum Command {
 /// If the service cannot be reached or refuses, and, for `--wait` and `watch`, if the job does not succeed.
 pub fn run(command: Command) -> anyhow::Result<()> {
     match command {
-        Command::Submit { file, wait, service } => submit(&file, wait, &service),
+        Command::Submit {
+            file,
+            mesh,
+            wait,
+            service,
+        } => submit(&file, &mesh, wait, &service),
         Command::List { service } => list(&service),
         Command::Show { job, service } => {
             let status: JobStatus = Client::new(&service.url)?.get(&format!("/v1/jobs/{job}"))?;
             print(&status, service.json)
         }
         Command::Watch { job, service } => watch(&Client::new(&service.url)?, &job, service.json),
+        Command::Retry { job, wait, service } => {
+            let client = Client::new(&service.url)?;
+            let status: JobStatus = client.post(&format!("/v1/jobs/{job}/retry"), &serde_json::json!({}))?;
+            if wait {
+                return watch(&client, &job, service.json);
+            }
+            print(&status, service.json)
+        }
         Command::Cancel { job, service } => {
             let client = Client::new(&service.url)?;
             let status: JobStatus = client.post(&format!("/v1/jobs/{job}/cancel"), &serde_json::json!({}))?;
@@ -84,7 +112,39 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     }
 }
 
-fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> {
+fn mesh_of_body(argument: &str) -> Result<(String, PathBuf), String> {
+    match argument.split_once('=') {
+        Some((body, file)) if !body.is_empty() && !file.is_empty() => Ok((body.to_owned(), file.into())),
+        _ => Err("expected BODY=FILE, for example lift=boom.inp".to_owned()),
+    }
+}
+
+/// The job with the hashes of meshes that are uploaded for it.
+fn with_meshes(client: &Client, text: &str, meshes: &[(String, PathBuf)]) -> anyhow::Result<String> {
+    let mut job: serde_json::Value = serde_json::from_str(text).context("the job is not JSON")?;
+    let fields = job.as_object_mut().context("the job is not a JSON object")?;
+    let given = fields
+        .entry("meshes")
+        .or_insert_with(|| serde_json::json!({}))
+        .as_object_mut()
+        .context("the job's \"meshes\" is not an object")?;
+    for (body, file) in meshes {
+        let content =
+            std::fs::read(file).with_context(|| format!("cannot read the mesh {}", file.display()))?;
+        let info: MeshInfo = client
+            .post_bytes("/v1/meshes", content)
+            .with_context(|| format!("mesh {}", file.display()))?;
+        given.insert(body.clone(), info.mesh_sha256.into());
+    }
+    Ok(job.to_string())
+}
+
+fn submit(
+    file: &Path,
+    meshes: &[(String, PathBuf)],
+    wait: bool,
+    service: &ServiceArgs,
+) -> anyhow::Result<()> {
     let mut text = String::new();
     if file == Path::new("-") {
         std::io::stdin()
@@ -95,6 +155,9 @@ fn submit(file: &Path, wait: bool, service: &ServiceArgs) -> anyhow::Result<()> 
             .with_context(|| format!("cannot read the job {}", file.display()))?;
     }
     let client = Client::new(&service.url)?;
+    if !meshes.is_empty() {
+        text = with_meshes(&client, &text, meshes)?;
+    }
     let status: JobStatus = client.post_text("/v1/jobs", text)?;
     if wait {
         return watch(&client, &status.job_id.to_string(), service.json);
@@ -162,6 +225,19 @@ fn print(status: &JobStatus, json: bool) -> anyhow::Result<()> {
         "runs     {} of {} done, {} failed",
         progress.runs_done, progress.runs_total, progress.runs_failed
     ))?;
+    let spent = &progress.spent;
+    let done = progress.runs_done + progress.settling_done;
+    if done > 0 {
+        let per_run_ms = |seconds: f64| 1e3 * seconds / done as f64;
+        super::print_line(format_args!(
+            "workers  {:.3} ms per run: {:.3} simulate, {:.3} encode, {:.3} put; {:.3} waiting beside",
+            per_run_ms(spent.simulate_s + spent.encode_s + spent.put_s),
+            per_run_ms(spent.simulate_s),
+            per_run_ms(spent.encode_s),
+            per_run_ms(spent.put_s),
+            per_run_ms(spent.wait_s)
+        ))?;
+    }
     if let (Some(id), Some(sha256)) = (&status.dataset_id, &status.dataset_sha256) {
         super::print_line(format_args!("data set {id} (SHA-256 {sha256})"))?;
     }

@@ -1,10 +1,18 @@
 //! `hydroflex machine`: inspect machine files.
 
 use anyhow::Context;
+use hydroflex_dataset::window::{band_steps, closing_step, paper_steps};
+use hydroflex_openapi::job::{Integrator, JobSpec};
 use hydroflex_sim::machine::Machine;
+use hydroflex_sim::scenario::plan_settling_run;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::summary::{BodySummary, MachineSummary, summarise};
+use hydroflex_sim::summary::{BodySummary, MachineSummary, payloads_kg, summarise};
+use hydroflex_sim::trajectory::RunSettings;
+use serde::Serialize;
 use std::fmt::Write;
+
+/// Settling runs per payload from which `show` takes its windows.
+const SETTLING_RUNS: u64 = 8;
 
 /// Subcommands of `hydroflex machine`.
 #[derive(Debug, clap::Subcommand)]
@@ -33,13 +41,136 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     let machine = Machine::load(&machine, &mesh)?;
     let simulator = Simulator::new(machine)?;
     let summary = summarise(&simulator)?;
+    let windows = windows(&simulator)?;
     if json {
+        let shown = Shown {
+            summary: &summary,
+            windows: &windows,
+        };
         println!(
             "{}",
-            serde_json::to_string_pretty(&summary).context("writing the summary")?
+            serde_json::to_string_pretty(&shown).context("writing the summary")?
         );
     } else {
-        print!("{}", text(&summary).context("writing the summary")?);
+        let mut out = text(&summary).context("writing the summary")?;
+        windows_text(&mut out, &summary, &windows).context("writing the summary")?;
+        print!("{out}");
+    }
+    Ok(())
+}
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Shown<'a> {
+    #[serde(flatten)]
+    summary: &'a MachineSummary,
+    /// SLIDE windows from settling runs, by payload and deflection channel.
+    windows: &'a [WindowRow],
+}
+
+/// Windows of one payload and channel.
+#[derive(Debug, Serialize)]
+struct WindowRow {
+    payload_kg: f64,
+    channel: String,
+    /// Means over the runs that settle: within a band about the end value, and the paper's rule.
+    band_s: Option<f64>,
+    paper_s: Option<f64>,
+    runs: u64,
+}
+
+/// Windows from a few settling runs of 2 s at random configurations, by both rules.
+fn windows(simulator: &Simulator) -> anyhow::Result<Vec<WindowRow>> {
+    let file = simulator.machine().file();
+    let channels = simulator.channels();
+    let is = |quantity: &'static str| {
+        move |(_, c): &(usize, &hydroflex_openapi::channel::Channel)| c.quantity == quantity
+    };
+    let valves: Vec<usize> = channels
+        .iter()
+        .enumerate()
+        .filter(is("valve opening"))
+        .map(|c| c.0)
+        .collect();
+    let mut rows = Vec::new();
+    for payload_kg in payloads_kg(file) {
+        let spec: JobSpec = serde_json::from_value(serde_json::json!({
+            "runs": 1, "payload_kg": payload_kg, "duration_s": 2.0, "settling_runs": SETTLING_RUNS,
+        }))?;
+        let settings = RunSettings {
+            integrator: Integrator::Accurate,
+            sample_time_s: spec.sample_time_s,
+        };
+        let mut runs = Vec::new();
+        for index in 0..SETTLING_RUNS {
+            let input = plan_settling_run(&spec, file, simulator, index)?;
+            runs.extend(simulator.run(&input, &settings));
+        }
+        for (k, channel) in channels.iter().enumerate().filter(is("deflection")) {
+            let mean_s = |steps: Vec<usize>| {
+                let sum: usize = steps.iter().sum();
+                (!steps.is_empty()).then(|| sum as f64 / steps.len() as f64 * spec.sample_time_s)
+            };
+            let band = runs.iter().filter_map(|run| {
+                let signals: Vec<&[f64]> = valves.iter().map(|&v| run.columns[v].as_slice()).collect();
+                band_steps(&run.columns[k], closing_step(&signals))
+            });
+            rows.push(WindowRow {
+                payload_kg,
+                channel: channel.name.clone(),
+                band_s: mean_s(band.collect()),
+                paper_s: mean_s(
+                    runs.iter()
+                        .filter_map(|run| paper_steps(&run.columns[k]))
+                        .collect(),
+                ),
+                runs: runs.len() as u64,
+            });
+        }
+    }
+    Ok(rows)
+}
+
+fn windows_text(out: &mut String, machine: &MachineSummary, windows: &[WindowRow]) -> std::fmt::Result {
+    writeln!(
+        out,
+        "\nsmall motions in the middle of the range, valves shut: decay 1/s (frequency Hz), slowest first"
+    )?;
+    for row in &machine.small_motions {
+        write!(out, "  {:10.1} kg ", row.payload_kg)?;
+        if let Some(failure) = &row.failure {
+            writeln!(out, "{failure}")?;
+            continue;
+        }
+        for (decay, hz) in row.decay_per_s.iter().zip(&row.frequency_hz) {
+            write!(out, " {decay:9.3} ({hz:.2})")?;
+        }
+        writeln!(out)?;
+    }
+    writeln!(
+        out,
+        "\nwindows: decay of the slowest motion to 1 %, and {SETTLING_RUNS} settling runs, s"
+    )?;
+    writeln!(
+        out,
+        "  {:>10} {:>12} {:>8} {:>8}  channel",
+        "payload kg", "eigenvalues", "band", "paper"
+    )?;
+    let seconds = |s: Option<f64>| s.map_or_else(|| "none".to_owned(), |s| format!("{s:.3}"));
+    for row in windows {
+        let small = machine
+            .small_motions
+            .iter()
+            .find(|s| s.payload_kg.total_cmp(&row.payload_kg).is_eq());
+        writeln!(
+            out,
+            "  {:10.1} {:>12} {:>8} {:>8}  {}",
+            row.payload_kg,
+            seconds(small.and_then(|s| s.window_s)),
+            seconds(row.band_s),
+            seconds(row.paper_s),
+            row.channel
+        )?;
     }
     Ok(())
 }

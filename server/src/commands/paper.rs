@@ -19,6 +19,7 @@ use hydroflex_openapi::job::{Excitation, JobSpec, TrainingSpec, ValueOrRange, Wi
 use hydroflex_openapi::model::EvaluationReport;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
+use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::RunInput;
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
@@ -198,24 +199,25 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
         );
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    let machine = Machine::load(&args.machine, &args.mesh)?;
+    let simulator = Simulator::new(Machine::load(&args.machine, &args.mesh)?)?;
+    let machine = simulator.machine();
     let mut cells = Vec::new();
     for &payload_kg in &args.payloads {
         let folder = args.out.join(format!("{payload_kg}kg"));
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
         let training = data_set(
             &args,
-            &machine,
+            machine,
             &folder,
             "training",
-            training_runs(&args, &machine, payload_kg)?,
+            training_runs(&args, &simulator, payload_kg)?,
         )?;
         let evaluation = data_set(
             &args,
-            &machine,
+            machine,
             &folder,
             "evaluation",
-            evaluation_runs(&args, &machine, payload_kg)?,
+            evaluation_runs(&args, &simulator, payload_kg)?,
         )?;
         for &sensors in &args.sensors {
             for structure in &args.structures {
@@ -260,16 +262,18 @@ fn job(args: &Args, payload_kg: f64, runs: u64, duration_s: f64, seed: u64) -> a
 }
 
 /// Random runs of 1 s: four fifths train, one fifth validates.
-fn training_runs(args: &Args, machine: &Machine, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+fn training_runs(args: &Args, simulator: &Simulator, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+    let file = simulator.machine().file();
     let count = args.runs + args.runs.div_ceil(4);
     let spec = job(args, payload_kg, count, 1.0, 0)?;
     (0..count)
-        .map(|index| Ok(plan_run(&spec, machine.file(), index)?))
+        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
         .collect()
 }
 
 /// Run 0 is the published cycle; random signals of the same length follow.
-fn evaluation_runs(args: &Args, machine: &Machine, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+fn evaluation_runs(args: &Args, simulator: &Simulator, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+    let file = simulator.machine().file();
     let mut spec = job(
         args,
         payload_kg,
@@ -278,10 +282,10 @@ fn evaluation_runs(args: &Args, machine: &Machine, payload_kg: f64) -> anyhow::R
         EVALUATION_SEED,
     )?;
     let mut runs: Vec<RunInput> = (0..=RANDOM_CANDIDATES)
-        .map(|index| Ok(plan_run(&spec, machine.file(), index)?))
+        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
         .collect::<anyhow::Result<_>>()?;
     spec.excitation = Excitation::Cycle;
-    runs[0] = plan_run(&spec, machine.file(), 0)?;
+    runs[0] = plan_run(&spec, file, simulator, 0)?;
     runs[0].angles_rad = vec![CYCLE_ANGLE_DEG.to_radians(); runs[0].angles_rad.len()];
     Ok(runs)
 }

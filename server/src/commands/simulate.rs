@@ -11,7 +11,7 @@ use hydroflex_openapi::dataset::{CodeFacts, DatasetSource, MachineFacts};
 use hydroflex_openapi::job::{Integrator, SampleType, Split};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::trajectory::{RunInput, RunSettings};
+use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -104,8 +104,12 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         // one chunk is simulated while the one before it is written
         scope.spawn(|| {
             for chunk in chunks(&runs, pool.current_num_threads()) {
-                let simulate = |run| simulate(&simulator, &settings, run, &bar);
-                let records = pool.install(|| chunk.par_iter().map(simulate).collect());
+                let records = pool.install(|| {
+                    chunk
+                        .par_chunks(group_size(&simulator, &settings, chunk))
+                        .flat_map_iter(|group| simulate(&simulator, &settings, group, &bar))
+                        .collect()
+                });
                 if sender.send(records).is_err() {
                     break; // the writer has failed, and says why
                 }
@@ -214,8 +218,30 @@ fn chunks(runs: &[RunInput], threads: usize) -> Vec<&[RunInput]> {
     chunks
 }
 
-fn simulate(simulator: &Simulator, settings: &RunSettings, run: &RunInput, bar: &ProgressBar) -> RunRecord {
-    let (outcome, flags, statistics) = match simulator.run(run, settings) {
+/// Runs that one thread takes at a time: enough to fill the vector registers, or one.
+fn group_size(simulator: &Simulator, settings: &RunSettings, chunk: &[RunInput]) -> usize {
+    let side_by_side = |run: &RunInput| simulator.runs_side_by_side(settings, run.payload_kg > 0.0);
+    if chunk.iter().any(side_by_side) {
+        CHUNK_RUNS_PER_THREAD
+    } else {
+        1
+    }
+}
+
+fn simulate(
+    simulator: &Simulator,
+    settings: &RunSettings,
+    runs: &[RunInput],
+    bar: &ProgressBar,
+) -> Vec<RunRecord> {
+    let results = simulator.run_batch(runs, settings);
+    bar.inc(runs.len() as u64);
+    let records = runs.iter().zip(results);
+    records.map(|(run, result)| record(run, result)).collect()
+}
+
+fn record(run: &RunInput, result: Result<Trajectory, RunFailure>) -> RunRecord {
+    let (outcome, flags, statistics) = match result {
         Ok(trajectory) => {
             let statistics = RunStatistics {
                 steps: trajectory.statistics.steps,
@@ -238,7 +264,6 @@ fn simulate(simulator: &Simulator, settings: &RunSettings, run: &RunInput, bar: 
             )
         }
     };
-    bar.inc(1);
     RunRecord {
         kind: RunKind::Job,
         run_id: run.run_id,

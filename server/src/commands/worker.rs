@@ -4,7 +4,7 @@ use crate::coordinator::train::{self, TrainerConfig};
 use crate::service;
 use anyhow::Context;
 use hydroflex_worker::lifetime;
-use hydroflex_worker::shard_loop::{self, Ended, WorkerConfig};
+use hydroflex_worker::shard_loop::{self, Ended, RunLimits, WorkerConfig};
 use std::path::PathBuf;
 use std::time::Duration;
 use tokio::sync::watch;
@@ -12,10 +12,11 @@ use tokio::sync::watch;
 /// Arguments of `hydroflex worker`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Database URL
+    /// Database URL: sqlite:PATH or postgres://USER@HOST/NAME
     #[arg(long, env = "HYDROFLEX_DATABASE", hide_env_values = true)]
     pub database: String,
-    /// Blob store URL
+    /// Store URL: file:///DIRECTORY or s3://BUCKET/PREFIX; the usual AWS_… variables name region, endpoint and
+    /// credentials
     #[arg(long, env = "HYDROFLEX_STORE", hide_env_values = true)]
     pub store: String,
     /// Directory for caches (default: a folder of the user's cache directory)
@@ -27,9 +28,9 @@ pub struct Args {
     /// Finish the shard in hand and stop after this many seconds
     #[arg(long)]
     pub drain_after: Option<u64>,
-    /// Longest time of one run in seconds; a run that takes longer counts as lost
-    #[arg(long, default_value_t = 600)]
-    pub run_limit: u64,
+    /// What a run may take
+    #[command(flatten)]
+    pub limits: LimitArgs,
     /// Simulate runs, or train networks
     #[arg(long, value_enum, default_value_t = Role::Simulate)]
     pub role: Role,
@@ -39,6 +40,28 @@ pub struct Args {
     /// Log as JSON lines
     #[arg(long)]
     pub json: bool,
+}
+
+/// What a run may take of a worker. A run that takes more is isolated and recorded; all others are delivered.
+#[derive(Debug, Clone, clap::Args)]
+pub struct LimitArgs {
+    /// Longest time of one run in seconds
+    #[arg(long, default_value_t = 600, env = "HYDROFLEX_RUN_LIMIT", value_parser = clap::value_parser!(u64).range(1..))]
+    pub run_limit: u64,
+    /// Most memory of a worker process in MiB; 0 for no limit
+    #[arg(long, default_value_t = 4096, env = "HYDROFLEX_MEMORY_LIMIT")]
+    pub memory_limit: u64,
+}
+
+impl LimitArgs {
+    /// In the worker's terms.
+    #[must_use]
+    pub fn limits(&self) -> RunLimits {
+        RunLimits {
+            time: Duration::from_secs(self.run_limit),
+            memory_bytes: self.memory_limit << 20,
+        }
+    }
 }
 
 /// What a worker does.
@@ -96,11 +119,11 @@ async fn work(args: Args) -> anyhow::Result<()> {
                 cache,
                 threads: args.threads,
                 drain_after: args.drain_after.map(Duration::from_secs),
-                run_limit: Duration::from_secs(args.run_limit),
+                limits: args.limits.limits(),
             };
             match shard_loop::work(config, told).await? {
                 Ended::Drained => Ok(()),
-                Ended::Hung => anyhow::bail!("a run hangs in this process"),
+                Ended::Spoiled => anyhow::bail!("a run takes more than it may, and cannot be stopped"),
             }
         }
         Role::Train => {
@@ -114,7 +137,8 @@ async fn work(args: Args) -> anyhow::Result<()> {
     }
 }
 
-fn default_cache() -> PathBuf {
+/// Where reduced bodies are kept if nobody says otherwise.
+pub(super) fn default_cache() -> PathBuf {
     let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".cache"));
     std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)

@@ -1,6 +1,7 @@
 //! Machines at the front desk: refused before anything runs, with the field at fault.
 
 use hydroflex_dataset::PublishSpec;
+use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::catalogue::MachineInfo;
 use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
 use hydroflex_openapi::job::{JobSpec, MachineRef};
@@ -15,6 +16,7 @@ use std::sync::Arc;
 /// Makes machines ready, off the async threads.
 pub struct MachineDesk {
     machines: Arc<Machines>,
+    blobs: Blobs,
 }
 
 /// A machine that passed every check.
@@ -22,11 +24,12 @@ pub struct MachineDesk {
 pub struct CheckedMachine(Arc<ReadyMachine>);
 
 impl MachineDesk {
-    /// Keeps reduced bodies in `cache`, where workers find them.
+    /// Keeps reduced bodies in `cache`, where workers find them; finds uploaded meshes in `blobs`.
     #[must_use]
-    pub fn new(cache: PathBuf) -> Self {
+    pub fn new(cache: PathBuf, blobs: Blobs) -> Self {
         Self {
             machines: Arc::new(Machines::new(cache)),
+            blobs,
         }
     }
 
@@ -35,11 +38,11 @@ impl MachineDesk {
     /// # Errors
     /// Says what is wrong with it.
     pub async fn checked(&self, spec: &JobSpec) -> Result<Arc<CheckedMachine>, FieldError> {
-        let (machines, asked) = (self.machines.clone(), spec.clone());
-        let ready = tokio::task::spawn_blocking(move || machines.ready(&asked)).await;
+        let (machines, blobs, asked) = (self.machines.clone(), self.blobs.clone(), spec.clone());
+        let ready = tokio::task::spawn_blocking(move || machines.ready(&asked, &blobs)).await;
         match ready {
             Ok(Ok(ready)) => Ok(Arc::new(CheckedMachine(ready))),
-            Ok(Err(refused)) => Err(refusal(&spec.machine, &refused)),
+            Ok(Err(refused)) => Err(refusal(spec, &refused)),
             Err(panic) => {
                 tracing::error!(%panic, "a machine made its check panic");
                 Err(FieldError::new("/machine", "this machine cannot be checked"))
@@ -48,12 +51,20 @@ impl MachineDesk {
     }
 }
 
-fn refusal(reference: &MachineRef, refused: &RefusedMachine) -> FieldError {
-    match (reference, refused) {
+fn refusal(spec: &JobSpec, refused: &RefusedMachine) -> FieldError {
+    match (&spec.machine, refused) {
         (_, RefusedMachine::Unknown { name, known }) => {
             FieldError::new("/machine", "no such machine is built in")
                 .value(name.as_str())
                 .allowed(known.join(", "))
+        }
+        (_, RefusedMachine::NoMesh { body, sha256 }) => {
+            FieldError::new(format!("/meshes/{body}"), "no such mesh was uploaded")
+                .value(sha256.as_str())
+                .allowed("the mesh_sha256 that POST /v1/meshes answered")
+        }
+        (_, RefusedMachine::Store { body, .. }) => {
+            FieldError::new(format!("/meshes/{body}"), refused.to_string())
         }
         (MachineRef::BuiltIn(name), _) => {
             FieldError::new("/machine", refused.to_string()).value(name.as_str())
@@ -62,7 +73,18 @@ fn refusal(reference: &MachineRef, refused: &RefusedMachine) -> FieldError {
     }
 }
 
+/// Random configurations looked at before a job is accepted, and the part of them from which the machine must be able
+/// to start. A run draws up to a thousand times.
+const REACH_DRAWS: u64 = 100;
+const REACH_LEAST: f64 = 0.05;
+
 impl CheckedMachine {
+    /// A machine that a worker would simulate.
+    #[must_use]
+    pub fn new(ready: Arc<ReadyMachine>) -> Self {
+        Self(ready)
+    }
+
     /// SHA-256 of the machine, hexadecimal.
     #[must_use]
     pub fn sha256(&self) -> &str {
@@ -80,12 +102,42 @@ impl CheckedMachine {
     /// # Errors
     /// The fields at fault.
     pub fn validate(&self, spec: &JobSpec) -> Result<(), Vec<FieldError>> {
-        scenario::validate(spec, self.0.machine().file())
+        let file = self.0.machine().file();
+        let mut errors = match scenario::validate(spec, file) {
+            Ok(()) => Vec::new(),
+            Err(errors) => errors,
+        };
+        if !JobSpec::PRIORITIES.contains(&spec.priority) {
+            errors.push(
+                FieldError::new("/priority", "not a priority")
+                    .value(spec.priority)
+                    .allowed("-100 to 100"),
+            );
+        }
+        if !errors.is_empty() {
+            return Err(errors);
+        }
+        let part = scenario::reachable_part(spec, file, &self.0.simulator, REACH_DRAWS);
+        if part < REACH_LEAST {
+            return Err(vec![FieldError::new(
+                "/initial_angle_deg",
+                format!(
+                    "{:?}: in {:.0} of {REACH_DRAWS} random configurations a cylinder starts outside the lengths it may \
+                     start at; choose ranges in which at least {} % can start",
+                    spec.initial_angle_deg,
+                    (1.0 - part) * REACH_DRAWS as f64,
+                    100.0 * REACH_LEAST,
+                ),
+            )]);
+        }
+        Ok(())
     }
 
     /// What decides the bytes of a job's data set, beside its runs.
     #[must_use]
     pub fn publish_spec(&self, spec: JobSpec) -> PublishSpec {
+        // When a job's turn comes changes no byte of what it makes.
+        let spec = JobSpec { priority: 0, ..spec };
         let file = self.0.machine().file();
         let machine = MachineFacts {
             name: file.name.clone(),

@@ -31,6 +31,9 @@ use watch::Watch;
 /// How often the ledger is looked at while a job is unfinished: a few reads of a local file, against
 /// workers that wait for their next shard.
 const BUSY_TICK: Duration = Duration::from_millis(50);
+/// How often objects are looked for that a worker put after its job was over and cleaned up: rare, and
+/// in nobody's way.
+const SWEEP: Duration = Duration::from_secs(60);
 /// And when there is none; whoever accepts a job calls.
 const IDLE_TICK: Duration = Duration::from_millis(500);
 
@@ -45,6 +48,8 @@ pub struct CoordinatorConfig {
     pub workers: usize,
     /// Silence after which a worker is given up.
     pub lease: Duration,
+    /// Unfinished jobs above which no more are accepted.
+    pub most_jobs: u64,
 }
 
 /// The coordinator; clones are handles on one.
@@ -64,7 +69,7 @@ impl Coordinator {
     /// A coordinator on a ledger and a store. Nothing happens before [`Coordinator::run`].
     #[must_use]
     pub fn new(ledger: Ledger, blobs: Blobs, config: CoordinatorConfig) -> Self {
-        let machines = MachineDesk::new(config.cache.clone());
+        let machines = MachineDesk::new(config.cache.clone(), blobs.clone());
         let publishing = Mutex::default();
         Self(Arc::new(Inner {
             ledger,
@@ -140,6 +145,28 @@ impl Coordinator {
         })
     }
 
+    /// Refuses one more job where there are as many as we look after.
+    ///
+    /// # Errors
+    /// Says how many there are.
+    pub async fn refuse_if_full(&self) -> Result<(), ApiError> {
+        let unfinished: u64 = self
+            .ledger()
+            .job_counts()
+            .await?
+            .iter()
+            .filter(|(state, _)| !state.is_final())
+            .map(|(_, count)| count)
+            .sum();
+        let most = self.config().most_jobs;
+        if unfinished < most {
+            return Ok(());
+        }
+        Err(ApiError::TooManyRequests(format!(
+            "{unfinished} jobs are unfinished, at most {most} are looked after; try again when some are done"
+        )))
+    }
+
     /// Checks a training against its data set.
     ///
     /// # Errors
@@ -170,8 +197,15 @@ impl Coordinator {
     pub async fn run(self, stop: CancellationToken) {
         let mut watch = Watch::new(self.config().lease);
         let mut tasks = tokio::task::JoinSet::new();
+        let mut swept: Option<Instant> = None;
         self.clear_scratch();
         loop {
+            if swept.is_none_or(|at| at.elapsed() > SWEEP) {
+                match self.sweep().await {
+                    Ok(()) => swept = Some(Instant::now()),
+                    Err(error) => tracing::debug!(%error, "orphans could not be looked for; trying again"),
+                }
+            }
             let pause = match self.tick(&mut watch, &mut tasks).await {
                 Ok(true) => BUSY_TICK,
                 Ok(false) => IDLE_TICK,
@@ -235,6 +269,21 @@ impl Coordinator {
             }
         }
         Ok(busy)
+    }
+
+    /// Deletes what late workers put for jobs whose objects have been deleted already.
+    async fn sweep(&self) -> anyhow::Result<()> {
+        for name in self.blobs().folders("shards").await? {
+            // What is not ours is not touched.
+            let Ok(job) = name.parse::<JobId>() else { continue };
+            if self.ledger().is_collected(job).await? {
+                let deleted = self.blobs().delete_below(&format!("shards/{job}")).await?;
+                if deleted > 0 {
+                    tracing::info!(%job, deleted, "orphans deleted");
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Workers that simulate; the configured number while none has reported.

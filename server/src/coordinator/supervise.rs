@@ -4,6 +4,7 @@
 //! threads of an async runtime come and go.
 
 use hydroflex_ledger::crash;
+use hydroflex_worker::shard_loop::RunLimits;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use std::ffi::OsString;
@@ -46,6 +47,8 @@ pub struct SuperviseConfig {
     /// write lock, and with it everybody else. Longer than a lease, so that its shard is given up first
     /// where that is possible.
     pub longest_stop: Duration,
+    /// What a worker's run may take.
+    pub limits: RunLimits,
 }
 
 /// Running children. Dropping the handle stops them.
@@ -196,6 +199,8 @@ fn spawn(role: &str, config: &SuperviseConfig) -> io::Result<Child> {
         .args(["worker", "--role", role, "--threads", &threads.to_string()])
         .arg(cache)
         .args(["--parent", &std::process::id().to_string()])
+        .args(["--run-limit", &config.limits.time.as_secs().to_string()])
+        .args(["--memory-limit", &(config.limits.memory_bytes >> 20).to_string()])
         // Not as arguments: a URL may hold a password, and everybody may read those.
         .env("HYDROFLEX_DATABASE", &config.database)
         .env("HYDROFLEX_STORE", &config.store)

@@ -10,6 +10,10 @@ use hydroflex_openapi::problem::{FieldError, PROBLEM_MEDIA_TYPE, Problem};
 /// Why a request was not fulfilled.
 #[derive(Debug)]
 pub enum ApiError {
+    /// No key, or one that is not valid.
+    Unauthorized(String),
+    /// The key is valid, and not for this.
+    Forbidden(String),
     /// Nothing is at that address.
     NotFound(String),
     /// The address exists, the method does not.
@@ -34,6 +38,14 @@ pub enum ApiError {
         /// Size of the file.
         size_bytes: u64,
     },
+    /// No form of an answer that the caller takes is given here.
+    NotAcceptable(String),
+    /// The state of things is not what the request's condition says.
+    PreconditionFailed(String),
+    /// The address speaks another protocol.
+    UpgradeRequired(String),
+    /// As much as can be done is being done.
+    TooManyRequests(String),
     /// The service cannot answer now.
     Unavailable(String),
     /// The service is at fault.
@@ -49,6 +61,20 @@ impl ApiError {
 
     fn parts(self) -> (StatusCode, &'static str, &'static str, String, Vec<FieldError>) {
         match self {
+            Self::Unauthorized(detail) => (
+                StatusCode::UNAUTHORIZED,
+                "unauthorized",
+                "Unauthorized",
+                detail,
+                Vec::new(),
+            ),
+            Self::Forbidden(detail) => (
+                StatusCode::FORBIDDEN,
+                "forbidden",
+                "Forbidden",
+                detail,
+                Vec::new(),
+            ),
             Self::NotFound(detail) => (
                 StatusCode::NOT_FOUND,
                 "not-found",
@@ -112,6 +138,34 @@ impl ApiError {
                 format!("the file has {size_bytes} bytes"),
                 Vec::new(),
             ),
+            Self::NotAcceptable(detail) => (
+                StatusCode::NOT_ACCEPTABLE,
+                "not-acceptable",
+                "Not acceptable",
+                detail,
+                Vec::new(),
+            ),
+            Self::PreconditionFailed(detail) => (
+                StatusCode::PRECONDITION_FAILED,
+                "precondition-failed",
+                "Precondition failed",
+                detail,
+                Vec::new(),
+            ),
+            Self::UpgradeRequired(detail) => (
+                StatusCode::UPGRADE_REQUIRED,
+                "upgrade-required",
+                "Upgrade required",
+                detail,
+                Vec::new(),
+            ),
+            Self::TooManyRequests(detail) => (
+                StatusCode::TOO_MANY_REQUESTS,
+                "too-many-requests",
+                "Too many requests",
+                detail,
+                Vec::new(),
+            ),
             Self::Unavailable(detail) => (
                 StatusCode::SERVICE_UNAVAILABLE,
                 "unavailable",
@@ -151,8 +205,19 @@ impl IntoResponse for ApiError {
         let mut response = (status, Json(problem)).into_response();
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_MEDIA_TYPE));
-        if status == StatusCode::SERVICE_UNAVAILABLE {
-            headers.insert(header::RETRY_AFTER, HeaderValue::from_static("2"));
+        let retry_after = match status {
+            StatusCode::SERVICE_UNAVAILABLE => Some("2"),
+            StatusCode::TOO_MANY_REQUESTS => Some("1"),
+            _ => None,
+        };
+        if let Some(seconds) = retry_after {
+            headers.insert(header::RETRY_AFTER, HeaderValue::from_static(seconds));
+        }
+        if status == StatusCode::UPGRADE_REQUIRED {
+            headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+        }
+        if status == StatusCode::UNAUTHORIZED {
+            headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
         }
         if let Some(size) = size
             && let Ok(value) = HeaderValue::from_str(&format!("bytes */{size}"))

@@ -35,6 +35,13 @@ pub async fn submit(
     body: JsonBody<JobSpec>,
 ) -> Result<Response, ApiError> {
     let key = idempotency_key(&headers, &body.bytes)?;
+    let is_repeated = match &key {
+        Some(key) => state.ledger().knows_key(key).await?,
+        None => false,
+    };
+    if !is_repeated {
+        state.coordinator().refuse_if_full().await?;
+    }
     let new = state.coordinator().accept(body.value).await?;
     let created = state.ledger().create_job(&new, key.as_ref()).await?;
     if let Created::New(id) = created {
@@ -105,6 +112,31 @@ pub async fn cancel(State(state): State<AppState>, Id(id): Id<JobId>) -> Result<
         tracing::info!(job = %id, "job cancelled");
         state.coordinator().wake();
     }
+    show_job(state.ledger(), id).await.map(Json)
+}
+
+/// Do again what failed
+///
+/// Of a job that is over: the runs that were given up because every attempt at them ended with its worker,
+/// then the data set, which is a new one, and its trainings; or, if every run is there, the trainings that
+/// failed. What is there already is not simulated again.
+#[utoipa::path(
+    post, path = "/v1/jobs/{job_id}/retry", tag = "jobs", operation_id = "retry_job",
+    params(("job_id" = JobId, Path)),
+    responses(
+        (status = 200, description = "The job, in work again", body = JobStatus),
+        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub async fn retry(State(state): State<AppState>, Id(id): Id<JobId>) -> Result<Json<JobStatus>, ApiError> {
+    if !state.ledger().retry_job(id).await? {
+        return Err(ApiError::Conflict(format!(
+            "job {id} is not over, or nothing of it can be done again: a cancelled job, or one without a data \
+             set, is submitted anew"
+        )));
+    }
+    tracing::info!(job = %id, "what failed is done again");
+    state.coordinator().wake();
     show_job(state.ledger(), id).await.map(Json)
 }
 

@@ -3,6 +3,7 @@
 //! Deliberately absent: any request field that names a path or a URL which the service would read.
 
 pub mod error;
+pub mod auth;
 pub mod extract;
 pub mod jobs;
 pub mod events;
@@ -11,11 +12,17 @@ pub mod files;
 pub mod archive;
 pub mod trainings;
 pub mod models;
+pub mod predict;
+pub mod aliases;
+pub mod inference;
 pub mod machines;
+pub mod meshes;
 pub mod operations;
+pub mod serve;
 
 use crate::coordinator::Coordinator;
 use crate::prediction::ModelRegistry;
+use crate::prediction::gate::Gate;
 use axum::Router;
 use axum::extract::{DefaultBodyLimit, Request};
 use axum::http::{Method, Uri};
@@ -23,18 +30,32 @@ use axum::response::{IntoResponse, Redirect, Response};
 use error::ApiError;
 use hydroflex_ledger::Ledger;
 use hydroflex_ledger::blobs::Blobs;
+use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
+use tower_http::CompressionLevel;
 use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::compression::CompressionLayer;
+use tower_http::compression::predicate::{NotForContentType, Predicate, SizeAbove};
+use tower_http::decompression::RequestDecompressionLayer;
+use tower_http::timeout::RequestBodyTimeoutLayer;
 use utoipa::OpenApi;
-use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
 use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
+
+/// Answers from this size on are compressed for callers who ask for it.
+const COMPRESSED_FROM_BYTES: u64 = 1024;
+/// Silence in the middle of a body after which its sender is given up.
+const BODY_SILENCE: Duration = Duration::from_secs(30);
 
 /// What every handler may use.
 #[derive(Clone)]
 pub struct AppState {
     coordinator: Coordinator,
     models: Arc<ModelRegistry>,
+    gate: Arc<Gate>,
+    door: Arc<auth::Door>,
 }
 
 impl AppState {
@@ -44,7 +65,22 @@ impl AppState {
         Self {
             coordinator,
             models: Arc::default(),
+            gate: Arc::default(),
+            door: Arc::new(auth::Door::new(false)),
         }
+    }
+
+    /// The same, asking for API keys.
+    #[must_use]
+    pub fn behind_keys(mut self) -> Self {
+        self.door = Arc::new(auth::Door::new(true));
+        self
+    }
+
+    /// Who may come in.
+    #[must_use]
+    pub fn door(&self) -> &auth::Door {
+        &self.door
     }
 
     /// The coordinator.
@@ -63,6 +99,18 @@ impl AppState {
     #[must_use]
     pub fn blobs(&self) -> &Blobs {
         self.coordinator.blobs()
+    }
+
+    /// How much is estimated at once.
+    #[must_use]
+    pub fn gate(&self) -> &Gate {
+        &self.gate
+    }
+
+    /// Directory for recordings that are too long for memory.
+    #[must_use]
+    pub fn prediction_scratch(&self) -> PathBuf {
+        self.coordinator.config().scratch.join("predictions")
     }
 
     /// Models in memory.
@@ -86,6 +134,7 @@ impl AppState {
         (name = "data sets", description = "Published trajectories, immutable, addressed by content"),
         (name = "trainings", description = "Networks for published data sets"),
         (name = "models", description = "Trained networks and their estimates"),
+        (name = "inference", description = "The same estimates by the Open Inference Protocol, version 2"),
         (name = "machines", description = "What can be simulated"),
         (name = "operations", description = "For whoever runs the service"),
     ),
@@ -97,6 +146,7 @@ fn routes() -> OpenApiRouter<AppState> {
         .routes(routes!(jobs::submit, jobs::list))
         .routes(routes!(jobs::show))
         .routes(routes!(jobs::cancel))
+        .routes(routes!(jobs::retry))
         .routes(routes!(events::follow))
         .routes(routes!(datasets::list))
         .routes(routes!(datasets::show))
@@ -105,12 +155,44 @@ fn routes() -> OpenApiRouter<AppState> {
         .routes(routes!(trainings::show))
         .routes(routes!(models::list))
         .routes(routes!(models::show))
-        .routes(routes!(models::predict))
+        .merge(prediction_routes())
         .routes(routes!(machines::list))
         .routes(routes!(machines::show))
+        .routes(routes!(meshes::upload).layer(DefaultBodyLimit::max(meshes::MESH_LIMIT_BYTES)))
         .routes(routes!(operations::live))
         .routes(routes!(operations::ready))
         .routes(routes!(operations::metrics))
+}
+
+/// Estimates: bodies may be compressed, and must not be silent for long.
+fn prediction_routes() -> OpenApiRouter<AppState> {
+    let worth_it = SizeAbove::new(COMPRESSED_FROM_BYTES)
+        .and(NotForContentType::new("application/vnd.apache"))
+        .and(NotForContentType::SSE);
+    let inference = OpenApiRouter::new()
+        .routes(routes!(inference::server))
+        .routes(routes!(inference::live))
+        .routes(routes!(inference::ready))
+        .routes(routes!(inference::model))
+        .routes(routes!(inference::model_version))
+        .routes(routes!(inference::model_ready))
+        .routes(routes!(inference::model_version_ready))
+        .routes(routes!(inference::infer))
+        .routes(routes!(inference::infer_version))
+        .layer(DefaultBodyLimit::max(inference::BODY_LIMIT_BYTES));
+    OpenApiRouter::new()
+        .routes(routes!(predict::predict))
+        .merge(inference)
+        .layer(RequestDecompressionLayer::new())
+        .layer(
+            CompressionLayer::new()
+                .quality(CompressionLevel::Fastest)
+                .compress_when(worth_it),
+        )
+        .layer(RequestBodyTimeoutLayer::new(BODY_SILENCE))
+        .routes(routes!(predict::stream))
+        .routes(routes!(aliases::list))
+        .routes(routes!(aliases::show, aliases::put))
 }
 
 /// Handlers whose path holds slashes: axum writes `{*path}`, OpenAPI has no word for it.
@@ -136,6 +218,7 @@ struct FileDocument;
 pub fn openapi() -> utoipa::openapi::OpenApi {
     let (_, mut document) = routes().split_for_parts();
     document.merge(FileDocument::openapi());
+    document.merge(predict::StreamDocument::openapi());
     document
 }
 
@@ -146,7 +229,7 @@ pub fn router(state: AppState) -> Router {
     let (router, _) = routes().split_for_parts();
     router
         .merge(file_routes())
-        .with_state(state)
+        .with_state(state.clone())
         .merge(SwaggerUi::new("/docs").url("/openapi.json", openapi()))
         .route(
             "/",
@@ -155,6 +238,7 @@ pub fn router(state: AppState) -> Router {
         .fallback(unknown_path)
         .method_not_allowed_fallback(unknown_method)
         .layer(DefaultBodyLimit::max(extract::BODY_LIMIT_BYTES))
+        .layer(axum::middleware::from_fn_with_state(state, auth::guard))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(axum::middleware::from_fn(operations::measure))
 }

@@ -1,8 +1,8 @@
-//! `/v1/models`: list, show, download, predict.
+//! `/v1/models`: list, show, download.
 
 use super::AppState;
 use super::error::ApiError;
-use super::extract::{Id, IdAndFile, JsonBody, Page, PageQuery, TimeCursor};
+use super::extract::{Id, IdAndFile, Page, PageQuery, TimeCursor};
 use super::files;
 use axum::Json;
 use axum::body::Body;
@@ -11,7 +11,6 @@ use axum::http::{HeaderMap, Method, Response};
 use hydroflex_ledger::{Ledger, ModelRecord};
 use hydroflex_openapi::catalogue::{ModelInfo, ModelPage};
 use hydroflex_openapi::id::ModelId;
-use hydroflex_openapi::prediction::{PredictRequest, PredictResponse};
 use hydroflex_openapi::problem::Problem;
 
 /// List models with their metrics, newest first
@@ -87,39 +86,6 @@ pub async fn file(
         method == Method::HEAD,
     )
     .await
-}
-
-/// Estimate deflection, strain and stress from sensor signals
-///
-/// `inputs` holds every input of the model by column name; a number stands for a constant signal.
-#[utoipa::path(
-    post, path = "/v1/models/{model_id}/predict", tag = "models", operation_id = "predict",
-    params(("model_id" = ModelId, Path)), request_body = PredictRequest,
-    responses(
-        (status = 200, description = "Estimates", body = PredictResponse),
-        (status = "default", description = "Refused", body = Problem, content_type = "application/problem+json"),
-    ),
-)]
-pub async fn predict(
-    State(state): State<AppState>,
-    Id(id): Id<ModelId>,
-    body: JsonBody<PredictRequest>,
-) -> Result<Json<PredictResponse>, ApiError> {
-    let model = match state.models().loaded(&id) {
-        Some(model) => model,
-        None => {
-            state
-                .models()
-                .load(&find(state.ledger(), &id).await?, state.blobs())
-                .await?
-        }
-    };
-    // A long recording takes a while: not on the threads that answer everybody.
-    let answer = tokio::task::spawn_blocking(move || model.predict(&body.value)).await;
-    answer
-        .map_err(|error| ApiError::Internal(error.to_string()))?
-        .map(Json)
-        .map_err(ApiError::Invalid)
 }
 
 async fn find(ledger: &Ledger, id: &ModelId) -> Result<ModelRecord, ApiError> {

@@ -9,7 +9,10 @@ use axum::response::{IntoResponse, Response};
 use hydroflex_openapi::problem::Problem;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 use std::sync::OnceLock;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+/// Probes ask often: one that hangs is answered "not ready" instead.
+const READY_WITHIN: Duration = Duration::from_secs(5);
 
 /// The process's recorder of metrics; made by whoever asks first.
 #[must_use]
@@ -68,7 +71,7 @@ pub async fn live() -> &'static str {
     "live\n"
 }
 
-/// The service can do its work: the database answers
+/// The service can do its work: database and store answer
 #[utoipa::path(
     get, path = "/health/ready", tag = "operations", operation_id = "ready",
     responses(
@@ -77,9 +80,25 @@ pub async fn live() -> &'static str {
     ),
 )]
 pub async fn ready(State(state): State<AppState>) -> Result<&'static str, ApiError> {
-    match state.ledger().ping().await {
-        Ok(()) => Ok("ready\n"),
-        Err(error) => Err(ApiError::Unavailable(error.to_string())),
+    let asked = async {
+        state
+            .ledger()
+            .ping()
+            .await
+            .map_err(|error| ApiError::Unavailable(error.to_string()))?;
+        state
+            .blobs()
+            .ping()
+            .await
+            .map_err(|error| ApiError::Unavailable(error.to_string()))
+    };
+    match tokio::time::timeout(READY_WITHIN, asked).await {
+        Ok(Ok(())) => Ok("ready\n"),
+        Ok(Err(error)) => Err(error),
+        Err(_) => Err(ApiError::Unavailable(format!(
+            "database and store did not answer within {} s",
+            READY_WITHIN.as_secs()
+        ))),
     }
 }
 
@@ -97,6 +116,15 @@ pub async fn metrics(State(state): State<AppState>) -> Result<Response, ApiError
     }
     for (shard_state, count) in state.ledger().shard_counts().await? {
         metrics::gauge!("hydroflex_shards", "state" => shard_state).set(count as f64);
+    }
+    let spent = state.ledger().time_spent().await?;
+    for (what, seconds) in [
+        ("simulate", spent.simulate_s),
+        ("encode", spent.encode_s),
+        ("put", spent.put_s),
+        ("wait", spent.wait_s),
+    ] {
+        metrics::gauge!("hydroflex_worker_seconds", "what" => what).set(seconds);
     }
     metrics::gauge!("hydroflex_workers").set(state.ledger().beats().await?.len() as f64);
     let text = recorder().render();

@@ -1,73 +1,83 @@
-//! One request for estimates, checked field by field and answered.
+//! One JSON request for estimates, checked field by field and answered.
 
-use super::LoadedModel;
+use super::{LoadedModel, SAMPLE_TIME_TOLERANCE, columns};
 use hydroflex_openapi::model::ModelConfig;
 use hydroflex_openapi::prediction::{PredictRequest, PredictResponse, Signal};
 use hydroflex_openapi::problem::FieldError;
 use std::borrow::Cow;
-
-/// Sample times that differ by less than this part are the same: 0.005 may come as 1/200.
-const SAMPLE_TIME_TOLERANCE: f64 = 1e-6;
+use std::collections::BTreeMap;
 
 impl LoadedModel {
     /// Estimates for recorded signals.
     ///
     /// # Errors
-    /// The inputs at fault: missing, unknown, too short, of different lengths, not finite.
+    /// The inputs at fault: missing, in another unit, unknown, too short, of different lengths, not finite.
     pub fn predict(&self, request: &PredictRequest) -> Result<PredictResponse, Vec<FieldError>> {
-        let config = self.model.config();
-        let columns = columns(config, request)?;
+        let config = self.config();
+        let columns = check(config, request)?;
         let views: Vec<&[f64]> = columns.iter().map(|column| column.as_ref()).collect();
-        let series = self.model.predictor().predict_series(&views);
-        let count = series.columns.first().map_or(0, Vec::len) as u64;
-        let names = config.targets.iter().map(|target| target.name.clone());
+        let predictor = self.predictor();
+        let series = self.with_workspace(|workspace| predictor.predict_series_with(&views, workspace));
+        let named = |columns: Vec<Vec<f64>>| -> BTreeMap<String, Vec<f64>> {
+            let names = config.targets.iter().map(|target| target.name.clone());
+            names.zip(columns).collect()
+        };
+        let bound = |sign: f64| {
+            predictor.has_intervals().then(|| {
+                let columns = series.columns.iter().enumerate().map(|(target, column)| {
+                    let half = |y: &f64| predictor.half_width(target, *y).unwrap_or(f64::NAN);
+                    column.iter().map(|y| y + sign * half(y)).collect()
+                });
+                named(columns.collect())
+            })
+        };
         Ok(PredictResponse {
-            model_id: self.id.clone(),
-            dataset_id: self.dataset_id.clone(),
+            model_id: self.id().clone(),
+            dataset_id: self.dataset_id().clone(),
+            provenance: self.provenance().clone(),
             sample_time_s: config.sample_time_s,
             window_steps: config.window_steps as u64,
             first_step: series.first_row as u64,
-            count,
-            estimates: names.zip(series.columns).collect(),
-            inside_envelope: (!series.inside.is_empty()).then_some(series.inside),
+            count: series.columns.first().map_or(0, Vec::len) as u64,
+            lower: bound(-1.0),
+            upper: bound(1.0),
+            inside_envelope: (!series.inside.is_empty()).then(|| series.inside.clone()),
+            estimates: named(series.columns),
         })
     }
 }
 
 /// One column per input of the model, in its order.
-fn columns<'a>(
+fn check<'a>(
     config: &ModelConfig,
     request: &'a PredictRequest,
 ) -> Result<Vec<Cow<'a, [f64]>>, Vec<FieldError>> {
     let mut errors = Vec::new();
     if let Some(sample_time_s) = request.sample_time_s {
-        let expected = config.sample_time_s;
-        let same = (sample_time_s / expected - 1.0).abs() <= SAMPLE_TIME_TOLERANCE;
-        if !same {
-            let error = FieldError::new("/sample_time_s", "the model was trained with another sample time");
-            errors.push(error.value(sample_time_s).allowed(expected.to_string()));
+        errors.extend(check_sample_time(config, sample_time_s));
+    }
+    let names: Vec<&str> = config.inputs.iter().map(|input| input.name.as_str()).collect();
+    let given: Vec<&str> = request.inputs.keys().map(String::as_str).collect();
+    let missing = columns::missing(config, &given, pointer);
+    for name in given.iter().filter(|name| !names.contains(name)) {
+        let pointer = pointer(name);
+        // One that is there in another unit is told once.
+        if missing.iter().all(|error| error.pointer != pointer) {
+            let error = FieldError::new(pointer, "not an input of this model");
+            errors.push(error.allowed(names.join(", ")));
         }
     }
-    let inputs: Vec<&str> = config.inputs.iter().map(|input| input.name.as_str()).collect();
-    for name in request.inputs.keys() {
-        if !inputs.contains(&name.as_str()) {
-            let error = FieldError::new(pointer(name), "not an input of this model");
-            errors.push(error.allowed(inputs.join(", ")));
-        }
-    }
+    errors.extend(missing);
     let steps = config.window_steps;
-    let length = request.inputs.values().find_map(|signal| match signal {
-        Signal::Samples(samples) => Some(samples.len()),
+    let length = request.inputs.iter().find_map(|(name, signal)| match signal {
+        Signal::Samples(samples) => Some((name.as_str(), samples.len())),
         Signal::Constant(_) => None,
     });
-    let length = length.unwrap_or(steps);
-    let mut columns = Vec::with_capacity(inputs.len());
-    for name in &inputs {
+    let (first, length) = length.unwrap_or(("", steps));
+    let mut columns = Vec::with_capacity(names.len());
+    for name in &names {
         match request.inputs.get(*name) {
-            None => errors.push(FieldError::new(
-                pointer(name),
-                "this input of the model is missing",
-            )),
+            None => {}
             Some(Signal::Constant(value)) => {
                 check_finite(name, &[*value], &mut errors);
                 columns.push(Cow::Owned(vec![*value; length]));
@@ -78,7 +88,7 @@ fn columns<'a>(
                     errors.push(
                         error
                             .value(samples.len())
-                            .allowed(format!("{length} samples, as in the first")),
+                            .allowed(format!("{length} samples, as in {first}")),
                     );
                 } else if samples.len() < steps {
                     let error = FieldError::new(pointer(name), "shorter than one window");
@@ -98,6 +108,18 @@ fn columns<'a>(
     } else {
         Err(errors)
     }
+}
+
+/// An error if a sample time is not the model's.
+#[must_use]
+pub fn check_sample_time(config: &ModelConfig, sample_time_s: f64) -> Option<FieldError> {
+    let expected = config.sample_time_s;
+    let same = (sample_time_s / expected - 1.0).abs() <= SAMPLE_TIME_TOLERANCE;
+    (!same).then(|| {
+        FieldError::new("/sample_time_s", "the model was trained with another sample time")
+            .value(sample_time_s)
+            .allowed(expected.to_string())
+    })
 }
 
 fn pointer(name: &str) -> String {

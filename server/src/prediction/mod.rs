@@ -1,63 +1,25 @@
-//! Estimates from registered models: loaded by content, checked at load, kept in memory.
+//! Estimates from registered models.
+//!
+//! - `registry`: models in memory, by content and by alias
+//! - `answer`: a JSON request, checked field by field
+//! - `columns`: which column of a request is which input
+//! - `table`: recordings of any length as Arrow or Parquet, a batch of rows at a time
+//! - `infer`: the Open Inference Protocol's tensors
+//! - `session`: a live signal, one sample at a time
+//! - `gate`: how much is done at once, and what is refused
+//!
+//! Nothing here knows a socket; `http/` does.
 
-mod answer;
+pub mod registry;
+pub mod columns;
+pub mod answer;
+pub mod table;
+pub mod spool;
+pub mod infer;
+pub mod session;
+pub mod gate;
 
-use crate::http::error::ApiError;
-use hydroflex_ledger::ModelRecord;
-use hydroflex_ledger::blobs::Blobs;
-use hydroflex_ml::model::Model;
-use hydroflex_openapi::id::{DatasetId, ModelId};
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+pub use registry::{LoadedModel, ModelRegistry};
 
-/// Models kept in memory; one takes a few megabytes.
-const KEPT: usize = 64;
-
-/// A model in memory.
-pub struct LoadedModel {
-    id: ModelId,
-    dataset_id: DatasetId,
-    model: Model,
-}
-
-/// The models in memory, the one used last at the back.
-#[derive(Default)]
-pub struct ModelRegistry {
-    loaded: Mutex<VecDeque<Arc<LoadedModel>>>,
-}
-
-impl ModelRegistry {
-    /// A model, if it is in memory.
-    #[must_use]
-    pub fn loaded(&self, id: &ModelId) -> Option<Arc<LoadedModel>> {
-        let mut loaded = self.loaded.lock().unwrap_or_else(PoisonError::into_inner);
-        let place = loaded.iter().position(|model| model.id == *id)?;
-        let model = loaded.remove(place)?;
-        loaded.push_back(model.clone());
-        Some(model)
-    }
-
-    /// Brings a model into memory: hashes, shapes and golden predictions are checked.
-    ///
-    /// # Errors
-    /// If the store does not answer or the model is damaged; the models in memory stay as they are.
-    pub async fn load(&self, record: &ModelRecord, blobs: &Blobs) -> Result<Arc<LoadedModel>, ApiError> {
-        let (folder, _temporary) = blobs.folder(&record.key(""), &record.files).await?;
-        let model = tokio::task::spawn_blocking(move || Model::load(&folder))
-            .await
-            .map_err(|error| ApiError::Internal(error.to_string()))?
-            .map_err(|error| ApiError::Internal(format!("model {} cannot be loaded: {error}", record.id)))?;
-        let model = Arc::new(LoadedModel {
-            id: record.id.clone(),
-            dataset_id: record.dataset_id.clone(),
-            model,
-        });
-        let mut loaded = self.loaded.lock().unwrap_or_else(PoisonError::into_inner);
-        loaded.retain(|other| other.id != record.id);
-        loaded.push_back(model.clone());
-        while loaded.len() > KEPT {
-            loaded.pop_front();
-        }
-        Ok(model)
-    }
-}
+/// Sample times that differ by less than this part are the same: 0.005 may come as 1/200.
+pub const SAMPLE_TIME_TOLERANCE: f64 = 1e-6;

@@ -4,6 +4,8 @@
 )]
 //! The whole router around a ledger and a store in a temporary directory; no workers, no sockets.
 
+pub(crate) mod models;
+
 use axum::Router;
 use axum::body::Body;
 use axum::http::{HeaderMap, Request, StatusCode};
@@ -30,6 +32,11 @@ pub(crate) struct Answer {
 
 impl Desk {
     pub(crate) async fn new() -> Self {
+        Self::with(1000, false).await
+    }
+
+    /// A desk that looks after at most so many jobs, or asks for keys.
+    pub(crate) async fn with(most_jobs: u64, keys: bool) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let url = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
         let ledger = Ledger::create(&url).await.unwrap();
@@ -40,9 +47,14 @@ impl Desk {
             cache: std::env::temp_dir().join("hydroflex-test-cache"),
             workers: 2,
             lease: Duration::from_secs(10),
+            most_jobs,
         };
         let coordinator = Coordinator::new(ledger.clone(), blobs.clone(), config);
-        let router = hydroflex_server::app(AppState::new(coordinator));
+        let mut state = AppState::new(coordinator);
+        if keys {
+            state = state.behind_keys();
+        }
+        let router = hydroflex_server::app(state);
         Self {
             ledger,
             blobs,
@@ -75,6 +87,19 @@ impl Desk {
             headers: parts.headers,
             body,
         }
+    }
+
+    /// Serves on a free port until the test ends.
+    pub(crate) async fn listen(&self) -> std::net::SocketAddr {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let stop = tokio_util::sync::CancellationToken::new();
+        tokio::spawn(hydroflex_server::http::serve::serve(
+            listener,
+            self.router.clone(),
+            stop,
+        ));
+        address
     }
 
     pub(crate) async fn get(&self, path: &str) -> Answer {

@@ -51,9 +51,9 @@ pub enum BodyError {
 pub struct FloatingFrame {
     mass_kg: f64,
     /// m χ.
-    first_moment_kg_m: Vector3<f64>,
+    pub(crate) first_moment_kg_m: Vector3<f64>,
     /// Θ₀ about the frame origin.
-    inertia_kg_m2: Matrix3<f64>,
+    pub(crate) inertia_kg_m2: Matrix3<f64>,
     /// ω² of every mode, s⁻².
     pub(crate) stiffness: Vec<f64>,
     /// Ψᵀ D Ψ of every mode, s⁻¹.
@@ -61,13 +61,13 @@ pub struct FloatingFrame {
     /// Columns of C_pt.
     pub(crate) c_pt: Vec<Vector3<f64>>,
     /// Columns of C_xp.
-    c_xp: Vec<Vector3<f64>>,
+    pub(crate) c_xp: Vec<Vector3<f64>>,
     /// Blocks N_m, each 9 values column by column.
-    n_blocks: Vec<f64>,
+    pub(crate) n_blocks: Vec<f64>,
     /// Row m: blocks B_mk for all k, each 9 values column by column.
-    b_rows: Vec<f64>,
+    pub(crate) b_rows: Vec<f64>,
     /// Row m: vectors c_mk for all k.
-    c_rows: Vec<f64>,
+    pub(crate) c_rows: Vec<f64>,
     /// Columns: generalised modes in the coordinates of the reduced body.
     basis: DMatrix<f64>,
 }
@@ -96,7 +96,7 @@ pub struct BodyMotion {
     /// m χ + C_pt η.
     moment_kg_m: Vector3<f64>,
     /// Θ.
-    inertia_kg_m2: Matrix3<f64>,
+    pub(crate) inertia_kg_m2: Matrix3<f64>,
     /// N_m + Σ_k η_k B_km, blocks of 9.
     f_blocks: Vec<f64>,
     /// Columns of R.

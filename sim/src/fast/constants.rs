@@ -3,42 +3,79 @@
 use super::record::Readout;
 use hydroflex_openapi::machine::{CylinderSpec, EndStopSpec, FrictionSpec};
 
-/// The body with its payload in mass-normalised modes, padded with zeros to `N` modes. The first
-/// `A` modes are those whose products enter the inertia (`sim/theory/minimal_coordinates.md`, §3).
+/// Constants of one kind of modes, padded with zeros to `N`.
 #[derive(Debug, Clone)]
-pub(super) struct Constants<const N: usize, const A: usize> {
+pub(super) struct ModeSet<const N: usize> {
     /// Modes in use.
     pub(super) used: usize,
-    /// Modes with inertia products.
-    pub(super) coupled: usize,
-    /// Θ₀ about the pivot with the payload, kg m².
-    pub(super) inertia_kg_m2: f64,
-    /// h₀: coupling of rotation and modes, √kg m.
-    pub(super) h0: [f64; N],
-    /// c: first-order change of inertia, √kg m.
-    pub(super) c: [f64; N],
-    /// B, symmetric.
-    pub(super) b: [[f64; A]; A],
-    /// C by columns: `cc[j][i]` = C_ij, antisymmetric.
-    pub(super) cc: [[f64; A]; A],
     /// w², 1/s².
     pub(super) w2: [f64; N],
     /// Diagonal of the damping matrix, 1/s.
     pub(super) d: [f64; N],
+    /// h₀: coupling of rotation and modes, √kg m.
+    pub(super) h0: [f64; N],
     /// Rod end per mode: x, y, z.
     pub(super) rod: [[f64; N]; 3],
-    /// Undeformed rod end relative to the pivot; z relative to the cylinder base, m.
-    pub(super) rod_m: [f64; 3],
     /// Modal force per gravity component x, y of the body frame.
     pub(super) weight: [[f64; N]; 2],
     /// Modal force of gravity along the axis of rotation.
     pub(super) weight_axial: [f64; N],
+    /// Change of the first moment that gravity acts on, per mode.
+    pub(super) moment: [[f64; N]; 2],
+}
+
+/// What a sensor row reads.
+#[derive(Debug, Clone)]
+pub(super) struct SensorRow<const A: usize, const B: usize, const Q: usize> {
+    /// Per coupled mode.
+    pub(super) coupled: [f64; A],
+    /// Per plain mode.
+    pub(super) plain: [f64; B],
+    /// Per follower.
+    pub(super) follower: [f64; Q],
+    /// Of modes that lag: per gravity x, gravity y, 1, and lagged force x, y, z.
+    pub(super) lagging: [f64; 6],
+}
+
+/// The body with its payload in mass-normalised modes, by what they take part in
+/// (`sim/theory/minimal_coordinates.md`, §3): `A` coupled modes, whose products enter the inertia; `B`
+/// plain ones, linear; `Q` followers, which do not act back. Modes that lag have no state.
+#[derive(Debug, Clone)]
+pub(super) struct Constants<const A: usize, const B: usize, const Q: usize> {
+    /// Coupled modes.
+    pub(super) coupled: ModeSet<A>,
+    /// Plain modes.
+    pub(super) plain: ModeSet<B>,
+    /// Followers.
+    pub(super) follower: ModeSet<Q>,
+    /// Θ₀ − |h₀|² over the modes that act back, kg m²: what moves with the frame whatever they do.
+    pub(super) hub_kg_m2: f64,
+    /// Its first-order change g = c + Cᵀh₀, √kg m, nearly zero where the modes are many.
+    pub(super) hub_change: [f64; A],
+    /// Its second-order change G = B − CᵀC, symmetric.
+    pub(super) hub_curvature: [[f64; A]; A],
+    /// c: half the first-order change of Θ, √kg m.
+    pub(super) c: [f64; A],
+    /// B, symmetric.
+    pub(super) b: [[f64; A]; A],
+    /// C by columns: `cc[j][i]` = C_ij, antisymmetric.
+    pub(super) cc: [[f64; A]; A],
+    /// c of plain modes.
+    pub(super) plain_c: [f64; B],
+    /// Rows of C for plain modes, by columns of coupled modes.
+    pub(super) plain_cc: [[f64; B]; A],
+    /// The same of followers.
+    pub(super) follower_c: [f64; Q],
+    /// The same of followers.
+    pub(super) follower_cc: [[f64; Q]; A],
+    /// Reciprocal of the lag, 1/s; 0 if no mode lags.
+    pub(super) lag_per_s: f64,
+    /// Undeformed rod end relative to the pivot; z relative to the cylinder base, m.
+    pub(super) rod_m: [f64; 3],
     /// First moment Σ m (x, y) that gravity acts on, kg m.
     pub(super) moment_kg_m: [f64; 2],
-    /// Its change per mode.
-    pub(super) moment: [[f64; N]; 2],
     /// Rows over the modes that sensors read.
-    pub(super) sensors: Vec<[f64; N]>,
+    pub(super) sensors: Vec<SensorRow<A, B, Q>>,
     /// One per sensor channel.
     pub(super) readouts: Vec<Readout>,
     /// Pivot to cylinder base in the global frame, m.
@@ -53,6 +90,7 @@ pub(super) struct Constants<const N: usize, const A: usize> {
 
 /// Typical ranges against which the local error is measured.
 #[derive(Debug, Clone, Copy)]
+#[allow(clippy::struct_field_names, reason = "each is a reciprocal of a unit")]
 pub(super) struct Scale {
     /// Reciprocal pressure range, 1/Pa.
     pub(super) per_pa: f64,

@@ -49,15 +49,15 @@ impl InstructionSet {
 }
 
 /// One run after the other.
-pub(super) fn one_by_one<const N: usize, const A: usize>(
+pub(super) fn one_by_one<const A: usize, const B: usize, const Q: usize>(
     set: InstructionSet,
-    c: &Constants<N, A>,
+    c: &Constants<A, B, Q>,
     common: &Common,
     inputs: &[RunInput],
     jobs: &[usize],
     results: &mut [Option<RunResult>],
 ) {
-    let buffer = &mut StepBuffer::<f64, N>::new();
+    let buffer = &mut StepBuffer::<f64, A, B, Q>::new();
     match set {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: the caller's set comes from `detect` or is checked against it.
@@ -76,9 +76,9 @@ pub(super) fn one_by_one<const N: usize, const A: usize>(
 }
 
 /// As many runs at a time as a register holds.
-pub(super) fn side_by_side<const N: usize, const A: usize>(
+pub(super) fn side_by_side<const A: usize, const B: usize, const Q: usize>(
     set: InstructionSet,
-    c: &Constants<N, A>,
+    c: &Constants<A, B, Q>,
     common: &Common,
     inputs: &[RunInput],
     jobs: &[usize],
@@ -107,50 +107,50 @@ mod x86 {
     use super::{Common, Constants, RunInput, RunResult, StepBuffer, simulate};
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx2")]
-    pub(super) fn one_by_one_avx512<const N: usize, const A: usize>(
-        c: &Constants<N, A>,
+    pub(super) fn one_by_one_avx512<const A: usize, const B: usize, const Q: usize>(
+        c: &Constants<A, B, Q>,
         common: &Common,
         inputs: &[RunInput],
         jobs: &[usize],
-        buffer: &mut StepBuffer<f64, N>,
+        buffer: &mut StepBuffer<f64, A, B, Q>,
         results: &mut [Option<RunResult>],
     ) {
         simulate(c, common, inputs, jobs, buffer, results);
     }
 
     #[target_feature(enable = "avx2")]
-    pub(super) fn one_by_one_avx2<const N: usize, const A: usize>(
-        c: &Constants<N, A>,
+    pub(super) fn one_by_one_avx2<const A: usize, const B: usize, const Q: usize>(
+        c: &Constants<A, B, Q>,
         common: &Common,
         inputs: &[RunInput],
         jobs: &[usize],
-        buffer: &mut StepBuffer<f64, N>,
+        buffer: &mut StepBuffer<f64, A, B, Q>,
         results: &mut [Option<RunResult>],
     ) {
         simulate(c, common, inputs, jobs, buffer, results);
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx2")]
-    pub(super) fn side_by_side_avx512<const N: usize, const A: usize>(
-        c: &Constants<N, A>,
+    pub(super) fn side_by_side_avx512<const A: usize, const B: usize, const Q: usize>(
+        c: &Constants<A, B, Q>,
         common: &Common,
         inputs: &[RunInput],
         jobs: &[usize],
         results: &mut [Option<RunResult>],
     ) {
-        let mut buffer = Box::new(StepBuffer::<Pack8, N>::new());
+        let mut buffer = Box::new(StepBuffer::<Pack8, A, B, Q>::new());
         simulate(c, common, inputs, jobs, &mut buffer, results);
     }
 
     #[target_feature(enable = "avx2")]
-    pub(super) fn side_by_side_avx2<const N: usize, const A: usize>(
-        c: &Constants<N, A>,
+    pub(super) fn side_by_side_avx2<const A: usize, const B: usize, const Q: usize>(
+        c: &Constants<A, B, Q>,
         common: &Common,
         inputs: &[RunInput],
         jobs: &[usize],
         results: &mut [Option<RunResult>],
     ) {
-        let mut buffer = Box::new(StepBuffer::<Pack4, N>::new());
+        let mut buffer = Box::new(StepBuffer::<Pack4, A, B, Q>::new());
         simulate(c, common, inputs, jobs, &mut buffer, results);
     }
 }

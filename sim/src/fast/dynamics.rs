@@ -1,36 +1,62 @@
 //! Right-hand side of the minimal-coordinate equations (`sim/theory/minimal_coordinates.md`, §2).
 
-use super::constants::{Constants, Cylinder};
+use super::constants::{Constants, Cylinder, ModeSet};
 use super::elementary::{exp, sin_cos, tanh};
 use super::lane::Lane;
 use super::sums::sums;
 use hydroflex_openapi::machine::{EndStopSpec, FrictionSpec};
 
-/// State: angle θ, modal coordinates z, their rates, pressures.
+/// A number per mode, by what the modes take part in.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Point<L, const N: usize> {
-    /// θ, rad.
-    pub(super) theta: L,
-    /// z, m √kg.
-    pub(super) z: [L; N],
-    /// ω, rad/s.
-    pub(super) omega: L,
-    /// v = dz/dt.
-    pub(super) v: [L; N],
-    /// Piston side, rod side, Pa.
-    pub(super) p: [L; 2],
+pub(super) struct PerMode<L, const A: usize, const B: usize, const Q: usize> {
+    /// Coupled modes.
+    pub(super) coupled: [L; A],
+    /// Plain modes.
+    pub(super) plain: [L; B],
+    /// Followers.
+    pub(super) follower: [L; Q],
 }
 
-impl<L: Lane, const N: usize> Point<L, N> {
+impl<L: Lane, const A: usize, const B: usize, const Q: usize> PerMode<L, A, B, Q> {
+    /// Zero everywhere.
+    pub(super) fn zero() -> Self {
+        let o = L::splat(0.0);
+        Self {
+            coupled: [o; A],
+            plain: [o; B],
+            follower: [o; Q],
+        }
+    }
+}
+
+/// State: angle θ, modal coordinates z, their rates, pressures, lagged force.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Point<L, const A: usize, const B: usize, const Q: usize> {
+    /// θ, rad.
+    pub(super) theta: L,
+    /// ω, rad/s.
+    pub(super) omega: L,
+    /// Piston side, rod side, Pa.
+    pub(super) p: [L; 2],
+    /// Force along the cylinder with the lag of the modes that have no state, N.
+    pub(super) lag: L,
+    /// z, m √kg.
+    pub(super) z: PerMode<L, A, B, Q>,
+    /// v = dz/dt.
+    pub(super) v: PerMode<L, A, B, Q>,
+}
+
+impl<L: Lane, const A: usize, const B: usize, const Q: usize> Point<L, A, B, Q> {
     /// Zero everywhere.
     pub(super) fn zero() -> Self {
         let zero = L::splat(0.0);
         Self {
             theta: zero,
-            z: [zero; N],
             omega: zero,
-            v: [zero; N],
             p: [zero; 2],
+            lag: zero,
+            z: PerMode::zero(),
+            v: PerMode::zero(),
         }
     }
 }
@@ -48,17 +74,19 @@ pub(super) struct Regime<L> {
     pub(super) filled: [L; 2],
 }
 
-/// Accelerations, pressure rates, and what the Jacobian and the recorder need of them.
+/// Accelerations, pressure rates, and what the recorder needs of them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Rates<L, const N: usize> {
+pub(super) struct Rates<L, const A: usize, const B: usize, const Q: usize> {
     /// α = dω/dt.
     pub(super) alpha: L,
     /// dv/dt.
-    pub(super) a: [L; N],
+    pub(super) a: PerMode<L, A, B, Q>,
     /// Pressure rates as if every chamber were filled, Pa/s.
     pub(super) p_raw: [L; 2],
     /// Pressure rates, Pa/s.
     pub(super) p: [L; 2],
+    /// Rate of the lagged force, N/s.
+    pub(super) lag: L,
     /// Eye-to-eye length, m.
     pub(super) length: L,
     /// Its rate, m/s.
@@ -69,12 +97,14 @@ pub(super) struct Rates<L, const N: usize> {
     pub(super) force: L,
     /// ∂length/∂θ.
     pub(super) jt: L,
-    /// ∂length/∂z.
-    pub(super) j: [L; N],
     /// Θ(z).
     pub(super) inertia: L,
-    /// h(z).
-    pub(super) h: [L; N],
+    /// h(z) of coupled modes.
+    pub(super) h: [L; A],
+    /// h(z) of plain modes.
+    pub(super) h_plain: [L; B],
+    /// h(z) of followers.
+    pub(super) h_follower: [L; Q],
     /// Unit vector along the cylinder, body frame.
     pub(super) n: [L; 3],
     /// Cylinder base relative to the pivot, body frame.
@@ -83,6 +113,13 @@ pub(super) struct Rates<L, const N: usize> {
     pub(super) gravity: [L; 2],
     /// First moment that gravity acts on.
     pub(super) moment: [L; 2],
+    /// What only the linearisation needs.
+    pub(super) slopes: Slopes<L>,
+}
+
+/// Derivatives of forces and flows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Slopes<L> {
     /// 1 / chamber compliance, Pa/m³, 0 for a chamber at vapour pressure.
     pub(super) stiffness: [L; 2],
     /// −∂flow/∂pressure, m³/(s Pa).
@@ -95,150 +132,290 @@ pub(super) struct Rates<L, const N: usize> {
     pub(super) spring: L,
 }
 
-impl<L: Lane, const N: usize> Rates<L, N> {
+impl<L: Lane, const A: usize, const B: usize, const Q: usize> Rates<L, A, B, Q> {
     /// Zero everywhere.
     pub(super) fn zero() -> Self {
         let o = L::splat(0.0);
         Self {
             alpha: o,
-            a: [o; N],
+            a: PerMode::zero(),
             p_raw: [o; 2],
             p: [o; 2],
+            lag: o,
             length: o,
             speed: o,
             cylinder_force: o,
             force: o,
             jt: o,
-            j: [o; N],
             inertia: o,
-            h: [o; N],
+            h: [o; A],
+            h_plain: [o; B],
+            h_follower: [o; Q],
             n: [o; 3],
             base: [o; 2],
             gravity: [o; 2],
             moment: [o; 2],
-            stiffness: [o; 2],
-            leak: [o; 2],
-            gain: [o; 2],
-            damping: o,
-            spring: o,
+            slopes: Slopes {
+                stiffness: [o; 2],
+                leak: [o; 2],
+                gain: [o; 2],
+                damping: o,
+                spring: o,
+            },
         }
     }
 }
 
-/// Evaluates the right-hand side at `y` with the valve opened by `opening`.
+/// Direction of the body frame, from which later ones of the same step are turned.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Heading<L> {
+    theta: L,
+    sine: L,
+    cosine: L,
+}
+
+/// Largest turn of the body within a step, rad: beyond it [`Heading::turned`] loses digits.
+pub(super) const LARGEST_TURN_RAD: f64 = 0.2;
+
+impl<L: Lane> Heading<L> {
+    /// Of any angle.
+    #[inline(always)]
+    pub(super) fn new(theta: L) -> Self {
+        let (sine, cosine) = sin_cos(theta);
+        Self { theta, sine, cosine }
+    }
+
+    /// Of an angle close by: Taylor series of the difference, within 1e-12 for 0.2 rad.
+    #[inline(always)]
+    fn turned(&self, theta: L) -> Self {
+        let k = |x: f64| L::splat(x);
+        let x = theta - self.theta;
+        let x2 = x * x;
+        let s = x * (k(1.0) + x2 * (k(-1.0 / 6.0) + x2 * (k(1.0 / 120.0) + x2 * k(-1.0 / 5040.0))));
+        let c = x2 * (k(-0.5) + x2 * (k(1.0 / 24.0) + x2 * (k(-1.0 / 720.0) + x2 * k(1.0 / 40320.0))));
+        Self {
+            theta,
+            sine: self.sine + (self.sine * c + self.cosine * s),
+            cosine: self.cosine + (self.cosine * c - self.sine * s),
+        }
+    }
+
+    /// A vector of the global frame in the body frame.
+    #[inline(always)]
+    fn body(&self, v: [f64; 2]) -> [L; 2] {
+        let k = |x: f64| L::splat(x);
+        [
+            self.cosine * k(v[0]) + self.sine * k(v[1]),
+            self.cosine * k(v[1]) - self.sine * k(v[0]),
+        ]
+    }
+}
+
+/// Evaluates the right-hand side at `y` with the valve opened by `opening`; `heading` is that of the
+/// step. `SLOPES` fills [`Rates::slopes`] too.
 #[inline(always)]
-pub(super) fn evaluate<L: Lane, const N: usize, const A: usize>(
-    c: &Constants<N, A>,
-    y: &Point<L, N>,
+pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    y: &Point<L, A, B, Q>,
+    heading: &Heading<L>,
     opening: L,
     regime: &Regime<L>,
-    r: &mut Rates<L, N>,
+    r: &mut Rates<L, A, B, Q>,
 ) {
-    let count = L::trip(N, c.used);
     let k = |x: f64| L::splat(x);
-    let (sine, cosine) = sin_cos(y.theta);
-    let turn = |v: [f64; 2]| {
-        [
-            cosine * k(v[0]) + sine * k(v[1]),
-            cosine * k(v[1]) - sine * k(v[0]),
-        ]
-    };
-    r.base = turn(c.base_m);
-    r.gravity = turn(c.gravity_m_per_s2);
+    let heading = heading.turned(y.theta);
+    r.base = heading.body(c.base_m);
+    r.gravity = heading.body(c.gravity_m_per_s2);
     let [gx, gy] = r.gravity;
 
     // Geometry of the cylinder
-    let shift = sums(count, |i| {
+    let (z, v, set) = (&y.z.coupled, &y.v.coupled, &c.coupled);
+    let coupled = sums!(L::trip(A, set.used), |i| {
+        let [x, y, axial] = [k(set.rod[0][i]), k(set.rod[1][i]), k(set.rod[2][i])];
         [
-            y.z[i] * k(c.rod[0][i]),
-            y.z[i] * k(c.rod[1][i]),
-            y.z[i] * k(c.rod[2][i]),
+            z[i] * x,
+            z[i] * y,
+            z[i] * axial,
+            v[i] * x,
+            v[i] * y,
+            v[i] * axial,
+            z[i] * k(set.moment[0][i]),
+            z[i] * k(set.moment[1][i]),
+            z[i] * k(c.hub_change[i]),
+            v[i] * k(c.c[i]),
         ]
     });
-    let rod = [shift[0] + k(c.rod_m[0]), shift[1] + k(c.rod_m[1])];
-    let d = [rod[0] - r.base[0], rod[1] - r.base[1], shift[2] + k(c.rod_m[2])];
+    let (z, v, set) = (&y.z.plain, &y.v.plain, &c.plain);
+    let plain = sums!(L::trip(B, set.used), |i| {
+        let [x, y, axial] = [k(set.rod[0][i]), k(set.rod[1][i]), k(set.rod[2][i])];
+        [
+            z[i] * x,
+            z[i] * y,
+            z[i] * axial,
+            v[i] * x,
+            v[i] * y,
+            v[i] * axial,
+            z[i] * k(set.moment[0][i]),
+            z[i] * k(set.moment[1][i]),
+        ]
+    });
+    let rod = [
+        (coupled[0] + plain[0]) + k(c.rod_m[0]),
+        (coupled[1] + plain[1]) + k(c.rod_m[1]),
+        (coupled[2] + plain[2]) + k(c.rod_m[2]),
+    ];
+    let d = [rod[0] - r.base[0], rod[1] - r.base[1], rod[2]];
     r.length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
     let reciprocal = k(1.0) / r.length;
     let n = [d[0] * reciprocal, d[1] * reciprocal, d[2] * reciprocal];
     r.n = n;
     r.jt = rod[0] * n[1] - rod[1] * n[0];
-    for i in 0..count {
-        r.j[i] = n[0] * k(c.rod[0][i]) + n[1] * k(c.rod[1][i]) + n[2] * k(c.rod[2][i]);
-    }
-    let [stretch, cz, cv, sx, sy] = sums(count, |i| {
-        [
-            r.j[i] * y.v[i],
-            y.z[i] * k(c.c[i]),
-            y.v[i] * k(c.c[i]),
-            y.z[i] * k(c.moment[0][i]),
-            y.z[i] * k(c.moment[1][i]),
-        ]
-    });
+    let stretch =
+        n[0] * (coupled[3] + plain[3]) + n[1] * (coupled[4] + plain[4]) + n[2] * (coupled[5] + plain[5]);
     r.speed = r.jt * y.omega + stretch;
-    r.moment = [sx + k(c.moment_kg_m[0]), sy + k(c.moment_kg_m[1])];
+    r.moment = [
+        (coupled[6] + plain[6]) + k(c.moment_kg_m[0]),
+        (coupled[7] + plain[7]) + k(c.moment_kg_m[1]),
+    ];
+    let (gz, cv) = (coupled[8], coupled[9]);
 
-    hydraulics(&c.cylinder, y, opening, regime, r);
+    hydraulics::<SLOPES, _, A, B, Q>(&c.cylinder, y, opening, regime, r);
+    r.lag = (r.force - y.lag) * k(c.lag_per_s);
 
     // Modal forces without the couplings of the rotation
+    let push = [r.force * n[0], r.force * n[1], r.force * n[2]];
     let omega2 = y.omega * y.omega;
-    for i in 0..count {
-        r.h[i] = k(c.h0[i]);
-        r.a[i] = gx * k(c.weight[0][i]) + gy * k(c.weight[1][i]) + k(c.weight_axial[i])
-            - r.force * r.j[i]
-            - y.z[i] * k(c.w2[i])
-            - y.v[i] * k(c.d[i])
-            + omega2 * k(c.c[i]);
-    }
-    let (bzz, bzv) = products(c, y, omega2, r);
-    r.inertia = k(c.inertia_kg_m2) + (cz + cz) + bzz;
+    loads(
+        &c.coupled,
+        [gx, gy],
+        push,
+        &y.z.coupled,
+        &y.v.coupled,
+        &mut r.a.coupled,
+    );
+    loads(&c.plain, [gx, gy], push, &y.z.plain, &y.v.plain, &mut r.a.plain);
+    loads(
+        &c.follower,
+        [gx, gy],
+        push,
+        &y.z.follower,
+        &y.v.follower,
+        &mut r.a.follower,
+    );
+    let (curvature, bzv) = products(c, y, omega2, r);
+    let hub = k(c.hub_kg_m2) + (gz + gz) + curvature;
     let coriolis = (y.omega + y.omega) * (cv + bzv);
     let torque = r.moment[0] * gy - r.moment[1] * gx - r.force * r.jt - coriolis;
 
     // Θ α + h·a = torque, h α + a = q
-    let [hq, hh] = sums(count, |i| [r.h[i] * r.a[i], r.h[i] * r.h[i]]);
-    r.alpha = (torque - hq) / (r.inertia - hh);
-    for i in 0..count {
-        r.a[i] -= r.h[i] * r.alpha;
+    let [hq, hh] = sums!(L::trip(A, c.coupled.used), |i| {
+        [r.h[i] * r.a.coupled[i], r.h[i] * r.h[i]]
+    });
+    let [plain_hq, plain_hh] = sums!(L::trip(B, c.plain.used), |i| {
+        [r.h_plain[i] * r.a.plain[i], r.h_plain[i] * r.h_plain[i]]
+    });
+    r.inertia = hub + (hh + plain_hh);
+    r.alpha = (torque - (hq + plain_hq)) / hub;
+    for i in 0..L::trip(A, c.coupled.used) {
+        r.a.coupled[i] -= r.h[i] * r.alpha;
+    }
+    for i in 0..L::trip(B, c.plain.used) {
+        r.a.plain[i] -= r.h_plain[i] * r.alpha;
+    }
+    for i in 0..L::trip(Q, c.follower.used) {
+        r.a.follower[i] -= r.h_follower[i] * r.alpha;
     }
 }
 
-/// Inertia products of the coupled modes: adds to h and to the modal forces, returns zᵀBz and vᵀBz.
+/// Weight, cylinder force along `push`, elastic and damping forces of modes.
 #[inline(always)]
-fn products<L: Lane, const N: usize, const A: usize>(
-    c: &Constants<N, A>,
-    y: &Point<L, N>,
+fn loads<L: Lane, const N: usize>(
+    set: &ModeSet<N>,
+    gravity: [L; 2],
+    push: [L; 3],
+    z: &[L; N],
+    v: &[L; N],
+    a: &mut [L; N],
+) {
+    let k = |x: f64| L::splat(x);
+    for i in 0..L::trip(N, set.used) {
+        let weight =
+            gravity[0] * k(set.weight[0][i]) + gravity[1] * k(set.weight[1][i]) + k(set.weight_axial[i]);
+        let force = push[0] * k(set.rod[0][i]) + push[1] * k(set.rod[1][i]) + push[2] * k(set.rod[2][i]);
+        a[i] = (weight - force) - (z[i] * k(set.w2[i]) + v[i] * k(set.d[i]));
+    }
+}
+
+/// C z and C v for modes of another kind, z and v those of the coupled ones.
+#[inline(always)]
+fn rows<L: Lane, const A: usize, const N: usize>(
+    matrix: &[[f64; N]; A],
+    columns: usize,
+    count: usize,
+    z: &[L; A],
+    v: &[L; A],
+) -> ([L; N], [L; N]) {
+    let mut cz = [L::splat(0.0); N];
+    let mut cv = [L::splat(0.0); N];
+    for j in 0..columns {
+        for i in 0..count {
+            cz[i] += z[j] * L::splat(matrix[j][i]);
+            cv[i] += v[j] * L::splat(matrix[j][i]);
+        }
+    }
+    (cz, cv)
+}
+
+/// Inertia products with the coupled modes: sets h, adds to the modal forces, returns zᵀGz and vᵀBz.
+#[inline(always)]
+fn products<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    y: &Point<L, A, B, Q>,
     omega2: L,
-    r: &mut Rates<L, N>,
+    r: &mut Rates<L, A, B, Q>,
 ) -> (L, L) {
-    let coupled = L::trip(A, c.coupled);
+    let count = L::trip(A, c.coupled.used);
     let zero = L::splat(0.0);
+    let (z, v) = (&y.z.coupled, &y.v.coupled);
     let mut bz = [zero; A];
     let mut cz = [zero; A];
     let mut cv = [zero; A];
-    for j in 0..coupled {
-        for i in 0..coupled {
-            bz[i] += y.z[j] * L::splat(c.b[j][i]);
-            cz[i] += y.z[j] * L::splat(c.cc[j][i]);
-            cv[i] += y.v[j] * L::splat(c.cc[j][i]);
+    let mut gz = [zero; A];
+    for j in 0..count {
+        for i in 0..count {
+            bz[i] += z[j] * L::splat(c.b[j][i]);
+            cz[i] += z[j] * L::splat(c.cc[j][i]);
+            cv[i] += v[j] * L::splat(c.cc[j][i]);
+            gz[i] += z[j] * L::splat(c.hub_curvature[j][i]);
         }
     }
     let twice = y.omega + y.omega;
-    for i in 0..coupled {
-        r.h[i] -= cz[i];
-        r.a[i] += twice * cv[i] + omega2 * bz[i];
+    for i in 0..count {
+        r.h[i] = L::splat(c.coupled.h0[i]) - cz[i];
+        r.a.coupled[i] += twice * cv[i] + omega2 * (L::splat(c.c[i]) + bz[i]);
     }
-    let [bzz, bzv] = sums(coupled, |i| [y.z[i] * bz[i], y.v[i] * bz[i]]);
-    (bzz, bzv)
+    let (cz, cv) = rows(&c.plain_cc, count, L::trip(B, c.plain.used), z, v);
+    for i in 0..L::trip(B, c.plain.used) {
+        r.h_plain[i] = L::splat(c.plain.h0[i]) - cz[i];
+        r.a.plain[i] += twice * cv[i] + omega2 * L::splat(c.plain_c[i]);
+    }
+    let (cz, cv) = rows(&c.follower_cc, count, L::trip(Q, c.follower.used), z, v);
+    for i in 0..L::trip(Q, c.follower.used) {
+        r.h_follower[i] = L::splat(c.follower.h0[i]) - cz[i];
+        r.a.follower[i] += twice * cv[i] + omega2 * L::splat(c.follower_c[i]);
+    }
+    let [curvature, bzv] = sums!(count, |i| [z[i] * gz[i], v[i] * bz[i]]);
+    (curvature, bzv)
 }
 
 /// Forces along the cylinder and pressure rates.
 #[inline(always)]
-fn hydraulics<L: Lane, const N: usize>(
+fn hydraulics<const SLOPES: bool, L: Lane, const A: usize, const B: usize, const Q: usize>(
     c: &Cylinder,
-    y: &Point<L, N>,
+    y: &Point<L, A, B, Q>,
     opening: L,
     regime: &Regime<L>,
-    r: &mut Rates<L, N>,
+    r: &mut Rates<L, A, B, Q>,
 ) {
     let k = |x: f64| L::splat(x);
     let area = [k(c.area_m2[0]), k(c.area_m2[1])];
@@ -246,43 +423,63 @@ fn hydraulics<L: Lane, const N: usize>(
     let u = r.length - k(c.spring[3]);
     let cubic = k(c.spring[1]) * u * u;
     r.force = r.cylinder_force + k(c.spring[0]) * u + k(c.spring[2]) * r.speed + cubic * u;
-    r.damping = k(c.damping + c.spring[2]);
-    r.spring = k(c.spring[0]) + cubic + cubic + cubic;
     let (friction, slope) = friction(&c.friction, r.speed);
     r.force += friction;
-    r.damping += slope;
+    let mut damping = k(c.damping + c.spring[2]) + slope;
+    let mut spring = k(c.spring[0]) + cubic + cubic + cubic;
     let stroke = r.length - k(c.closed_length_m);
     let left = k(c.stroke_m) - stroke;
     if let Some(stop) = &c.stop {
-        end_stop(stop, -stroke, -r.speed, k(-1.0), r);
-        end_stop(stop, -left, r.speed, k(1.0), r);
+        for (depth, rate, sign) in [(-stroke, -r.speed, -1.0), (-left, r.speed, 1.0)] {
+            let contact = end_stop(stop, depth, rate, k(sign));
+            r.force += contact.force;
+            damping += contact.damping;
+            spring += contact.spring;
+        }
     }
-    let chamber = [stroke, left];
+    // One division for both chambers. One whose piston has left the barrel keeps a hundredth of the hose.
+    let compliance = |i: usize, chamber: L| {
+        let least = k(0.01 * c.compliance_m3_per_pa[i]);
+        let compliance = k(c.compliance_m3_per_pa[i]) + k(c.compliance_slope_m2_per_pa[i]) * chamber;
+        least.where_less(compliance, least, compliance)
+    };
+    let compliance = [compliance(0, stroke), compliance(1, left)];
+    let both = k(1.0) / (compliance[0] * compliance[1]);
+    let stiffness = [compliance[1] * both, compliance[0] * both];
     let swept = [-(area[0] * r.speed), area[1] * r.speed];
     for i in 0..2 {
-        // A chamber whose piston has left the barrel keeps a hundredth of the hose.
-        let least = k(0.01 * c.compliance_m3_per_pa[i]);
-        let compliance = k(c.compliance_m3_per_pa[i]) + k(c.compliance_slope_m2_per_pa[i]) * chamber[i];
-        let compliance = least.where_less(compliance, least, compliance);
-        let stiffness = k(1.0) / compliance;
         let drop = regime.line_pa[i] - y.p[i];
         let root = drop.abs().sqrt();
-        r.gain[i] = (k(c.flow) * root).copysign(drop);
-        // The slope of the root is infinite at zero drop; the cap is in the Jacobian only.
-        r.leak[i] = opening * k(0.5 * c.flow) / root.max(k(30.0));
-        r.p_raw[i] = stiffness * (swept[i] + opening * r.gain[i]);
+        let gain = (k(c.flow) * root).copysign(drop);
+        r.p_raw[i] = stiffness[i] * (swept[i] + opening * gain);
         r.p[i] = r.p_raw[i] * regime.filled[i];
-        r.stiffness[i] = stiffness * regime.filled[i];
+        if SLOPES {
+            r.slopes.gain[i] = gain;
+            // The slope of the root is infinite at zero drop; the cap is in the Jacobian only.
+            r.slopes.leak[i] = opening * k(0.5 * c.flow) / root.max(k(30.0));
+            r.slopes.stiffness[i] = stiffness[i] * regime.filled[i];
+        }
+    }
+    if SLOPES {
+        r.slopes.damping = damping;
+        r.slopes.spring = spring;
     }
 }
 
 /// Depth over which the damping of a stop grows to its full value, m; the force is continuous.
 const STOP_DAMPING_DEPTH_M: f64 = 1e-4;
 
-/// Adds one end stop: `k depth + d min(1, depth/δ) (depth rate)`, never pulling; `sign` −1 at the
-/// inner stop, which pushes the eyes apart.
+/// Force of an end stop along the cylinder, and its slopes over speed and length.
+struct Contact<L> {
+    force: L,
+    damping: L,
+    spring: L,
+}
+
+/// One end stop: `k depth + d min(1, depth/δ) (depth rate)`, never pulling; `sign` −1 at the inner
+/// stop, which pushes the eyes apart.
 #[inline(always)]
-fn end_stop<L: Lane, const N: usize>(stop: &EndStopSpec, depth: L, rate: L, sign: L, r: &mut Rates<L, N>) {
+fn end_stop<L: Lane>(stop: &EndStopSpec, depth: L, rate: L, sign: L) -> Contact<L> {
     let k = |x: f64| L::splat(x);
     let (zero, one) = (k(0.0), k(1.0));
     let share = depth * k(1.0 / STOP_DAMPING_DEPTH_M);
@@ -292,11 +489,13 @@ fn end_stop<L: Lane, const N: usize>(stop: &EndStopSpec, depth: L, rate: L, sign
     let damping = k(stop.damping_n_s_per_m) * share;
     let push = k(stop.stiffness_n_per_m) * depth + damping * rate;
     // Both conditions in one number: the smaller of depth and push must be positive.
-    let contact = depth.where_less(depth, push, push);
+    let touching = depth.where_less(depth, push, push);
     let stiffness = k(stop.stiffness_n_per_m) + ramp;
-    r.force += (sign * push).where_less(zero, contact, zero);
-    r.damping += damping.where_less(zero, contact, zero);
-    r.spring += stiffness.where_less(zero, contact, zero);
+    Contact {
+        force: (sign * push).where_less(zero, touching, zero),
+        damping: damping.where_less(zero, touching, zero),
+        spring: stiffness.where_less(zero, touching, zero),
+    }
 }
 
 /// Friction force (tension positive) and its slope over speed (theory note §8).

@@ -14,7 +14,7 @@ const HALF_PI: [f64; 3] = [
     2.022_266_248_795_951e-21,
 ];
 /// ln 2 in two parts, the first with 32 significant bits.
-const LN_2: [f64; 2] = [6.931_471_803_691_238_2e-1, 1.908_214_929_270_587_7e-10];
+const LN_2: [f64; 2] = [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10];
 
 /// Sine and cosine, within 2 ulp for |x| < 10⁴.
 #[inline(always)]

@@ -3,7 +3,7 @@
 //! Lanes share the instructions and nothing else: a run's numbers do not depend on its neighbours.
 
 use super::constants::Constants;
-use super::dynamics::{Point, Regime};
+use super::dynamics::{Point, Rates, Regime};
 use super::lane::Lane;
 use super::record::machine_channels;
 use super::statics::rest;
@@ -16,11 +16,16 @@ use crate::trajectory::{RunFailure, RunInput, Trajectory};
 /// Result of one run of a batch.
 pub(super) type RunResult = Result<Trajectory, RunFailure>;
 
+/// Smallest local tolerance: below it the error estimate is rounding.
+const LEAST_LOCAL: f64 = 5e-9;
+
 /// What all runs of a batch have in common.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Common {
     /// Time between samples, s.
     pub(super) sample_time_s: f64,
+    /// Promised largest error of a channel over its range.
+    pub(super) tolerance: f64,
     /// Reciprocal squared local tolerance.
     pub(super) per_tolerance2: f64,
     /// Method.
@@ -32,9 +37,10 @@ impl Common {
     /// and the stiff modes lower the order, so the local tolerance falls with its square; the factor
     /// is measured on the published boom (`sim/theory/minimal_coordinates.md`, §6).
     pub(super) fn new(sample_time_s: f64, tolerance: f64) -> Self {
-        let local = (700.0 * tolerance * tolerance).clamp(1e-12, 1e-2);
+        let local = (250.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
         Self {
             sample_time_s,
+            tolerance,
             per_tolerance2: 1.0 / (local * local),
             method: &RODAS5P,
         }
@@ -43,12 +49,12 @@ impl Common {
 
 /// Simulates `inputs` in the order of `jobs` and puts each result into its place of `results`.
 #[inline(always)]
-pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
-    c: &Constants<N, A>,
+pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
     common: &Common,
     inputs: &[RunInput],
     jobs: &[usize],
-    buffer: &mut StepBuffer<L, N>,
+    buffer: &mut StepBuffer<L, A, B, Q>,
     results: &mut [Option<RunResult>],
 ) {
     let zero = L::splat(0.0);
@@ -56,7 +62,7 @@ pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
     let channels = super::record::MACHINE_CHANNELS + c.readouts.len();
     let mut queue = jobs.iter();
     let mut tracks: Vec<Option<Track<'_>>> = (0..L::WIDTH).map(|_| None).collect();
-    let mut state = Point::<L, N>::zero();
+    let mut state = Point::<L, A, B, Q>::zero();
     let mut step_s = L::splat(common.sample_time_s);
     let mut regime = Regime {
         opening: zero,
@@ -69,18 +75,19 @@ pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
     let mut idle_ready = false;
     loop {
         let mut busy = false;
-        for lane in 0..L::WIDTH {
-            while tracks[lane].is_none() {
+        let mut recording = false;
+        for (lane, place) in tracks.iter_mut().enumerate() {
+            while place.is_none() {
                 let Some(&job) = queue.next() else { break };
                 match rest(c, inputs[job].angles_rad[0]) {
                     Ok(start) => {
                         if !idle_ready {
                             idle_ready = true;
                             for other in 0..L::WIDTH {
-                                load(&mut state, other, &start.state, c.used);
+                                load(&mut state, other, &start.state);
                             }
                         }
-                        load(&mut state, lane, &start.state, c.used);
+                        load(&mut state, lane, &start.state);
                         let track = Track::new(
                             job,
                             &inputs[job],
@@ -89,13 +96,14 @@ pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
                             start.length_m,
                             cylinder,
                         );
-                        tracks[lane] = Some(track);
+                        *place = Some(track);
                     }
                     Err(failure) => results[job] = Some(Err(failure)),
                 }
             }
-            if let Some(track) = &mut tracks[lane] {
+            if let Some(track) = place {
                 busy = true;
+                recording |= track.record_due;
                 track.plan();
                 step_s.set(lane, track.step_s);
                 let (opening, rate, lines) = track.valve_state(cylinder);
@@ -115,44 +123,66 @@ pub(super) fn simulate<L: Lane, const N: usize, const A: usize>(
             return;
         }
         step(c, common.method, &state, step_s, &regime, buffer);
-        if tracks.iter().flatten().any(|t| t.record_due) {
-            let count = L::trip(N, c.used);
-            for (reading, row) in readings.iter_mut().zip(&c.sensors) {
-                let [sum] = sums(count, |i| [state.z[i] * L::splat(row[i])]);
-                *reading = sum;
-            }
+        if recording {
+            read(c, &state, &buffer.start, &mut readings);
         }
         let error2 = buffer.error2 * L::splat(common.per_tolerance2);
-        for lane in 0..L::WIDTH {
-            let Some(mut track) = tracks[lane].take() else {
-                continue;
-            };
-            match advance(&mut track, &state, buffer, &readings, error2.get(lane), lane, c) {
-                Ok(Some(Verdict::Accept)) => {
-                    take(&mut state, lane, &buffer.next, c.used);
-                    tracks[lane] = Some(track);
-                }
-                Ok(Some(Verdict::Repeat)) => tracks[lane] = Some(track),
+        let mut accepted = zero;
+        for (lane, place) in tracks.iter_mut().enumerate() {
+            let Some(track) = place else { continue };
+            match advance(track, &state, buffer, &readings, error2.get(lane), lane, c) {
+                Ok(Some(Verdict::Accept)) => accepted.set(lane, 1.0),
+                Ok(Some(Verdict::Repeat)) => {}
                 Ok(None) => {
-                    let job = track.job;
-                    results[job] = Some(Ok(track.finish()));
+                    if let Some(track) = place.take() {
+                        let job = track.job;
+                        results[job] = Some(Ok(track.finish()));
+                    }
                 }
-                Err(failure) => results[track.job] = Some(Err(failure)),
+                Err(failure) => {
+                    results[track.job] = Some(Err(failure));
+                    *place = None;
+                }
             }
         }
+        take(c, &mut state, &buffer.next, accepted);
+    }
+}
+
+/// What the sensors' rows read.
+#[inline(always)]
+fn read<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    state: &Point<L, A, B, Q>,
+    start: &Rates<L, A, B, Q>,
+    readings: &mut [L],
+) {
+    let k = |x: f64| L::splat(x);
+    let z = &state.z;
+    let [fx, fy, fz] = start.n.map(|n| n * state.lag);
+    for (reading, row) in readings.iter_mut().zip(&c.sensors) {
+        let [coupled] = sums!(L::trip(A, c.coupled.used), |i| [z.coupled[i] * k(row.coupled[i])]);
+        let [plain] = sums!(L::trip(B, c.plain.used), |i| [z.plain[i] * k(row.plain[i])]);
+        let [follower] = sums!(L::trip(Q, c.follower.used), |i| {
+            [z.follower[i] * k(row.follower[i])]
+        });
+        let part = &row.lagging;
+        let weight = start.gravity[0] * k(part[0]) + start.gravity[1] * k(part[1]) + k(part[2]);
+        let force = fx * k(part[3]) + fy * k(part[4]) + fz * k(part[5]);
+        *reading = (coupled + plain) + (follower + (weight + force));
     }
 }
 
 /// Records and judges one lane; `None` when the run is finished.
 #[inline(always)]
-fn advance<L: Lane, const N: usize, const A: usize>(
+fn advance<L: Lane, const A: usize, const B: usize, const Q: usize>(
     track: &mut Track<'_>,
-    state: &Point<L, N>,
-    buffer: &StepBuffer<L, N>,
+    state: &Point<L, A, B, Q>,
+    buffer: &StepBuffer<L, A, B, Q>,
     readings: &[L],
     error2: f64,
     lane: usize,
-    c: &Constants<N, A>,
+    c: &Constants<A, B, Q>,
 ) -> Result<Option<Verdict>, RunFailure> {
     if track.record_due {
         let machine = machine_channels(track.valve_at_sample(), track.alpha, state, &buffer.start, lane);
@@ -162,7 +192,7 @@ fn advance<L: Lane, const N: usize, const A: usize>(
         }
     }
     let next = &buffer.next;
-    let both = |f: fn(&super::dynamics::Rates<L, N>) -> &[L; 2]| {
+    let both = |f: fn(&Rates<L, A, B, Q>) -> &[L; 2]| {
         let (a, b) = (f(&buffer.start), f(&buffer.end));
         [[a[0].get(lane), a[1].get(lane)], [b[0].get(lane), b[1].get(lane)]]
     };
@@ -180,32 +210,56 @@ fn advance<L: Lane, const N: usize, const A: usize>(
     track.judge(&outcome, &c.cylinder).map(Some)
 }
 
-fn load<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Point<f64, N>, used: usize) {
+/// Puts a run's state into a lane, padding included.
+fn load<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    state: &mut Point<L, A, B, Q>,
+    lane: usize,
+    from: &Point<f64, A, B, Q>,
+) {
     state.theta.set(lane, from.theta);
     state.omega.set(lane, from.omega);
-    for i in 0..used {
-        state.z[i].set(lane, from.z[i]);
-        state.v[i].set(lane, from.v[i]);
-    }
+    state.lag.set(lane, from.lag);
     for i in 0..2 {
         state.p[i].set(lane, from.p[i]);
     }
+    for (to, from) in [(&mut state.z, &from.z), (&mut state.v, &from.v)] {
+        for (to, from) in to.coupled.iter_mut().zip(&from.coupled) {
+            to.set(lane, *from);
+        }
+        for (to, from) in to.plain.iter_mut().zip(&from.plain) {
+            to.set(lane, *from);
+        }
+        for (to, from) in to.follower.iter_mut().zip(&from.follower) {
+            to.set(lane, *from);
+        }
+    }
 }
 
-/// Copies one lane.
+/// Moves the lanes that are accepted (1, the others 0) to the new state.
 #[inline(always)]
-fn take<L: Lane, const N: usize>(state: &mut Point<L, N>, lane: usize, from: &Point<L, N>, used: usize) {
-    if L::WIDTH == 1 {
-        *state = *from;
-        return;
-    }
-    state.theta.set(lane, from.theta.get(lane));
-    state.omega.set(lane, from.omega.get(lane));
-    for i in 0..used {
-        state.z[i].set(lane, from.z[i].get(lane));
-        state.v[i].set(lane, from.v[i].get(lane));
-    }
+fn take<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    state: &mut Point<L, A, B, Q>,
+    from: &Point<L, A, B, Q>,
+    accepted: L,
+) {
+    let half = L::splat(0.5);
+    let blend = |to: &mut L, from: &L| *to = from.where_less(half, accepted, *to);
+    blend(&mut state.theta, &from.theta);
+    blend(&mut state.omega, &from.omega);
+    blend(&mut state.lag, &from.lag);
     for i in 0..2 {
-        state.p[i].set(lane, from.p[i].get(lane));
+        blend(&mut state.p[i], &from.p[i]);
+    }
+    for (to, from) in [(&mut state.z, &from.z), (&mut state.v, &from.v)] {
+        for i in 0..L::trip(A, c.coupled.used) {
+            blend(&mut to.coupled[i], &from.coupled[i]);
+        }
+        for i in 0..L::trip(B, c.plain.used) {
+            blend(&mut to.plain[i], &from.plain[i]);
+        }
+        for i in 0..L::trip(Q, c.follower.used) {
+            blend(&mut to.follower[i], &from.follower[i]);
+        }
     }
 }

@@ -5,6 +5,10 @@
     clippy::inline_always,
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
+#![allow(
+    clippy::needless_range_loop,
+    reason = "a loop over modes or chambers reads several arrays at once"
+)]
 #![doc = include_str!("../../theory/minimal_coordinates.md")]
 
 mod constants;
@@ -23,7 +27,7 @@ mod solve;
 mod statics;
 mod step;
 mod sums;
-mod tableau;
+pub(crate) mod tableau;
 mod track;
 
 #[cfg(test)]
@@ -161,10 +165,11 @@ impl PlanarModel {
                 return;
             }
         };
+        let order = self.order(modes, common.tolerance);
         // The sizes that the loop is compiled for; padding modes are zero.
         macro_rules! sizes {
-            ($(($modes:literal, $coupled:literal)),*) => {
-                $(if let Some(c) = self.constants::<$modes, $coupled>(modes) {
+            ($(($coupled:literal, $plain:literal, $followers:literal)),*) => {
+                $(if let Some(c) = self.constants::<$coupled, $plain, $followers>(modes, &order) {
                     match layout {
                         Layout::OneByOne => dispatch::one_by_one(set, &c, common, inputs, &fit, results),
                         Layout::SideBySide => dispatch::side_by_side(set, &c, common, inputs, &fit, results),
@@ -173,7 +178,7 @@ impl PlanarModel {
                 })*
             };
         }
-        sizes!((8, 4), (16, 8), (32, 32));
+        sizes!((4, 4, 4), (8, 8, 8), (32, 32, 32));
     }
 
     fn check(&self, input: &RunInput) -> Result<(), RunFailure> {

@@ -1,6 +1,6 @@
 //! Which machines have minimal coordinates, and their constants.
 
-use super::constants::{Constants, Cylinder, Scale};
+use super::constants::{Constants, Cylinder, ModeSet, Scale, SensorRow};
 use super::eigen;
 use super::record::Readout;
 use crate::reduction::{ReducedBody, ReducedInterface};
@@ -234,23 +234,18 @@ impl PlanarModel {
         })
     }
 
-    /// Constants of the step loop for a payload, padded to `N` modes of which `A` have inertia
-    /// products. `None` if the modes do not fit.
-    pub(super) fn constants<const N: usize, const A: usize>(&self, modes: &Modes) -> Option<Constants<N, A>> {
-        self.ordered_constants(modes, &self.order(modes))
-    }
-
-    /// The same for a given order of the modes.
-    pub(super) fn ordered_constants<const N: usize, const A: usize>(
+    /// Constants of the step loop for a payload, padded to the sizes given. `None` if the modes do
+    /// not fit.
+    pub(super) fn constants<const A: usize, const B: usize, const Q: usize>(
         &self,
         modes: &Modes,
         order: &Order,
-    ) -> Option<Constants<N, A>> {
-        let n = modes.w2.len();
-        if n > N || order.coupled > A {
+    ) -> Option<Constants<A, B, Q>> {
+        if order.coupled.len() > A || order.plain.len() > B || order.followers.len() > Q {
             return None;
         }
-        let phi = DMatrix::from_fn(n, n, |i, j| modes.phi[(i, order.columns[j])]);
+        let phi = &modes.phi;
+        let n = modes.w2.len();
         let m = if self.payload.is_some() {
             modes.payload_kg
         } else {
@@ -260,18 +255,11 @@ impl PlanarModel {
             .payload
             .clone()
             .unwrap_or_else(|| (Vector3::zeros(), Matrix3xX::zeros(n)));
-        let row = |index: usize| rows.row(index) * &phi;
+        let row = |index: usize| rows.row(index) * phi;
         let (px, py) = (row(0), row(1));
-        let plane = |m: &Matrix3xX<f64>, index: usize| m.row(index) * &phi;
-        let pad = |x: &dyn Fn(usize) -> f64| {
-            let mut out = [0.0; N];
-            for (k, out) in out.iter_mut().enumerate().take(n) {
-                *out = x(k);
-            }
-            out
-        };
-        let (h0, c) = (&self.h0 * &phi, &self.c * &phi);
-        let weight = [0, 1, 2].map(|i| plane(&self.first_moment, i) + row(i) * m);
+        let h0 = &self.h0 * phi + (&py * at.x - &px * at.y) * m;
+        let c = &self.c * phi + (&px * at.x + &py * at.y) * m;
+        let weight = [0, 1, 2].map(|i| self.first_moment.row(i) * phi + row(i) * m);
         let moment = [0, 1].map(|i| {
             if self.deformed_moment {
                 weight[i].clone()
@@ -279,46 +267,54 @@ impl PlanarModel {
                 row(i) * m
             }
         });
-        let rod = [0, 1, 2].map(|i| plane(&self.rod, i));
-        let b = phi.transpose() * &self.b * &phi + (px.transpose() * &px + py.transpose() * &py) * m;
-        let cc = phi.transpose() * &self.cc * &phi + (py.transpose() * &px - px.transpose() * &py) * (-m);
-        let square = |m: &DMatrix<f64>| {
-            let mut out = [[0.0; A]; A];
-            for (j, column) in out.iter_mut().enumerate().take(order.coupled) {
-                for (i, x) in column.iter_mut().enumerate().take(order.coupled) {
-                    *x = m[(i, j)];
-                }
+        let parts = Parts {
+            w2: &modes.w2,
+            d: &modes.damping,
+            h0,
+            rod: [0, 1, 2].map(|i| self.rod.row(i) * phi),
+            axial: &weight[2] * self.gravity_m_per_s2[2],
+            weight,
+            moment,
+        };
+        let b = phi.transpose() * &self.b * phi + (px.transpose() * &px + py.transpose() * &py) * m;
+        let cc = phi.transpose() * &self.cc * phi + (py.transpose() * &px - px.transpose() * &py) * (-m);
+        let square = |m: &DMatrix<f64>| columns(m, &order.coupled, &order.coupled);
+        // With many modes Θ − |h|² is a small difference, of parts in 1e5: it is formed here from all
+        // modes, since with some products left out it may come out negative in the step loop.
+        let inertia_kg_m2 = self.inertia_kg_m2 + m * (at.x * at.x + at.y * at.y);
+        let acting = order.coupled.iter().chain(&order.plain);
+        let acting_h2: f64 = acting.map(|&k| parts.h0[k] * parts.h0[k]).sum();
+        let hub_change = &c + &parts.h0 * &cc;
+        let sensor = |row: &RowDVector<f64>| {
+            let row = row * phi;
+            SensorRow {
+                coupled: padded(&order.coupled, |k| row[k]),
+                plain: padded(&order.plain, |k| row[k]),
+                follower: padded(&order.followers, |k| row[k]),
+                lagging: parts.at_rest(&order.lagging, &row),
             }
-            out
         };
         Some(Constants {
-            used: n,
-            coupled: order.coupled,
-            inertia_kg_m2: self.inertia_kg_m2 + m * (at.x * at.x + at.y * at.y),
-            h0: pad(&|k| h0[k] + m * (at.x * py[k] - at.y * px[k])),
-            c: pad(&|k| c[k] + m * (at.x * px[k] + at.y * py[k])),
+            coupled: parts.set(&order.coupled),
+            plain: parts.set(&order.plain),
+            plain_c: padded(&order.plain, |k| c[k]),
+            plain_cc: columns(&cc, &order.plain, &order.coupled),
+            follower_c: padded(&order.followers, |k| c[k]),
+            follower_cc: columns(&cc, &order.followers, &order.coupled),
+            follower: parts.set(&order.followers),
+            hub_kg_m2: inertia_kg_m2 - acting_h2,
+            hub_change: padded(&order.coupled, |k| hub_change[k]),
+            hub_curvature: square(&(&b - cc.transpose() * &cc)),
+            c: padded(&order.coupled, |k| c[k]),
             b: square(&b),
             cc: square(&cc),
-            w2: pad(&|k| modes.w2[order.columns[k]]),
-            d: pad(&|k| modes.damping[order.columns[k]]),
-            rod: [0, 1, 2].map(|i| pad(&|k| rod[i][k])),
+            lag_per_s: order.lagging.last().map_or(0.0, |_| 1.0 / modes.lag_s()),
             rod_m: self.rod_m.into(),
-            weight: [0, 1].map(|i| pad(&|k| weight[i][k])),
-            weight_axial: pad(&|k| weight[2][k] * self.gravity_m_per_s2[2]),
             moment_kg_m: [
                 self.centre_moment_kg_m.x + m * at.x,
                 self.centre_moment_kg_m.y + m * at.y,
             ],
-            moment: [0, 1].map(|i| pad(&|k| moment[i][k])),
-            sensors: self
-                .sensors
-                .rows
-                .iter()
-                .map(|s| {
-                    let s = s * &phi;
-                    pad(&|k| s[k])
-                })
-                .collect(),
+            sensors: self.sensors.rows.iter().map(sensor).collect(),
             readouts: self.sensors.readouts.clone(),
             base_m: self.base_m,
             gravity_m_per_s2: [self.gravity_m_per_s2[0], self.gravity_m_per_s2[1]],
@@ -346,43 +342,145 @@ impl PlanarModel {
         }
     }
 
-    /// Modes by how far the machine's forces deflect them. Those of at least a five-hundredth of
-    /// the largest have inertia products; the others change Θ and h by less than the products of
-    /// their tiny amplitude (§3 of the theory page has the estimate, a test the proof).
-    pub(super) fn order(&self, modes: &Modes) -> Order {
+    /// Sorts the modes by what they take part in (§3 of the theory page has the estimates, tests the
+    /// proof): each simplification changes results by a fraction of `tolerance`.
+    pub(super) fn order(&self, modes: &Modes, tolerance: f64) -> Order {
         let c = &self.cylinder;
         let force_n = (c.supply_pa - c.tank_pa).max(1.0) * c.area_m2[0];
         let g = Vector3::from(self.gravity_m_per_s2).norm();
         let rod = &self.rod * &modes.phi;
         let weight = &self.first_moment * &modes.phi;
-        let amplitude: Vec<f64> = (0..modes.w2.len())
-            .map(|k| {
+        let all: Vec<usize> = (0..modes.w2.len()).collect();
+        let reach = |k: usize| rod[(0, k)].hypot(rod[(1, k)]);
+        let amplitude: Vec<f64> = all
+            .iter()
+            .map(|&k| {
                 let push = force_n * rod[(0, k)].abs().max(rod[(1, k)].abs());
                 let pull = g * weight[(0, k)].abs().max(weight[(1, k)].abs());
                 (push + pull) / modes.w2[k]
             })
             .collect();
-        let mut columns: Vec<usize> = (0..amplitude.len()).collect();
-        columns.sort_by(|&i, &j| amplitude[j].total_cmp(&amplitude[i]).then(i.cmp(&j)));
-        let largest = columns.first().map_or(0.0, |&k| amplitude[k]);
-        let coupled = columns
-            .iter()
-            .take_while(|&&k| amplitude[k] >= COUPLED * largest)
-            .count();
-        Order { columns, coupled }
+        let largest = amplitude.iter().fold(0.0, |a: f64, &b| a.max(b));
+        let flexibility: f64 = all.iter().map(|&k| reach(k).powi(2) / modes.w2[k]).sum();
+        let h0 = &self.h0 * &modes.phi;
+        let acts_back = |k: usize| {
+            let at_rod = reach(k).powi(2) / modes.w2[k] / flexibility;
+            at_rod.max(h0[k] * h0[k] / self.inertia_kg_m2)
+        };
+        let rows: Vec<_> = self.sensors.rows.iter().map(|row| row * &modes.phi).collect();
+        let seen = |k: usize| {
+            let share = |row: &RowDVector<f64>| {
+                let total: f64 = all.iter().map(|&j| row[j].abs() * amplitude[j]).sum();
+                row[k].abs() * amplitude[k] / total.max(f64::MIN_POSITIVE)
+            };
+            rows.iter().map(share).fold(0.0, f64::max)
+        };
+        let lag_s = modes.lag_s();
+        let lags = |k: usize| {
+            let same_lag = (modes.damping[k] / modes.w2[k] - lag_s).abs() < 1e-6 * lag_s;
+            same_lag && seen(k) * USUAL_RATE_PER_S.powi(2) / modes.w2[k] < LAGGING * tolerance
+        };
+        let coupled = if tolerance < 5e-4 { COUPLED } else { 5.0 * COUPLED };
+        let mut order = Order::default();
+        for k in all.iter().copied() {
+            if acts_back(k) < FOLLOWING * tolerance {
+                if lags(k) {
+                    order.lagging.push(k);
+                } else {
+                    order.followers.push(k);
+                }
+            } else if amplitude[k] >= coupled * largest {
+                order.coupled.push(k);
+            } else {
+                order.plain.push(k);
+            }
+        }
+        order
     }
 }
 
 /// Smallest amplitude, over the largest, of a mode with inertia products.
 const COUPLED: f64 = 2e-3;
+/// Largest share in the flexibility of the rod end and in the inertia, over the tolerance, of a mode
+/// that does not act back. Leaving out 1 % of the flexibility costs 2.5e-3 of range, so this costs a
+/// twentieth of the tolerance.
+const FOLLOWING: f64 = 0.2;
+/// Largest error of a sensor, over the tolerance, for which a mode without inertia is good enough.
+const LAGGING: f64 = 0.05;
+/// Rate at which the forces on stiff modes usually change, 1/s: a vibration of 50 Hz.
+const USUAL_RATE_PER_S: f64 = 300.0;
 
-/// Order of the modes in the step loop.
-#[derive(Debug, Clone)]
+/// Modes by what they take part in, ascending frequency in each.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Order {
-    /// Columns of the mode matrix.
-    pub(super) columns: Vec<usize>,
-    /// How many of the first have inertia products.
-    pub(super) coupled: usize,
+    /// With inertia products.
+    pub(super) coupled: Vec<usize>,
+    /// Linear.
+    pub(super) plain: Vec<usize>,
+    /// Moved by the others, without acting back.
+    pub(super) followers: Vec<usize>,
+    /// The same, and so stiff that they follow the cylinder force with a first-order lag.
+    pub(super) lagging: Vec<usize>,
+}
+
+/// `of` each of these modes, then zeros.
+fn padded<const N: usize>(modes: &[usize], of: impl Fn(usize) -> f64) -> [f64; N] {
+    let mut out = [0.0; N];
+    for (out, &k) in out.iter_mut().zip(modes) {
+        *out = of(k);
+    }
+    out
+}
+
+/// Columns `j` of a matrix, each with the rows `i`, padded.
+fn columns<const N: usize, const A: usize>(m: &DMatrix<f64>, rows: &[usize], j: &[usize]) -> [[f64; N]; A] {
+    let mut out = [[0.0; N]; A];
+    for (column, &j) in out.iter_mut().zip(j) {
+        *column = padded(rows, |i| m[(i, j)]);
+    }
+    out
+}
+
+/// What every mode has, in the order of the modes.
+struct Parts<'a> {
+    w2: &'a [f64],
+    d: &'a [f64],
+    h0: RowDVector<f64>,
+    rod: [RowDVector<f64>; 3],
+    weight: [RowDVector<f64>; 3],
+    axial: RowDVector<f64>,
+    moment: [RowDVector<f64>; 2],
+}
+
+impl Parts<'_> {
+    fn set<const N: usize>(&self, modes: &[usize]) -> ModeSet<N> {
+        let of = |row: &RowDVector<f64>| padded(modes, |k| row[k]);
+        ModeSet {
+            used: modes.len(),
+            w2: padded(modes, |k| self.w2[k]),
+            d: padded(modes, |k| self.d[k]),
+            h0: of(&self.h0),
+            rod: [0, 1, 2].map(|i| of(&self.rod[i])),
+            weight: [0, 1].map(|i| of(&self.weight[i])),
+            weight_axial: of(&self.axial),
+            moment: [0, 1].map(|i| of(&self.moment[i])),
+        }
+    }
+
+    /// What a row reads of these modes at rest, z = (G·g − F Ψᵀn)/w²: per gravity x, y, 1, and force
+    /// x, y, z.
+    fn at_rest(&self, modes: &[usize], row: &RowDVector<f64>) -> [f64; 6] {
+        let sum = |load: &RowDVector<f64>| modes.iter().map(|&k| row[k] * load[k] / self.w2[k]).sum::<f64>();
+        let [x, y, z] = [0, 1, 2].map(|i| -sum(&self.rod[i]));
+        [
+            sum(&self.weight[0]),
+            sum(&self.weight[1]),
+            sum(&self.axial),
+            x,
+            y,
+            z,
+        ]
+    }
 }
 
 /// Modes of the body with one payload.
@@ -393,6 +491,16 @@ pub(super) struct Modes {
     damping: Vec<f64>,
     /// Modal coordinates of the body per mode, ascending frequency.
     pub(super) phi: DMatrix<f64>,
+}
+
+impl Modes {
+    /// Lag of a very stiff mode behind its load, d/w² of the stiffest one, s.
+    fn lag_s(&self) -> f64 {
+        match (self.damping.last(), self.w2.last()) {
+            (Some(d), Some(w2)) => d / w2,
+            _ => 0.0,
+        }
+    }
 }
 
 /// The ground's point and the body's interface of two attachments, whichever comes first.

@@ -34,11 +34,11 @@ impl Readout {
 }
 
 /// What the machine's own channels read in one lane.
-pub(super) fn machine_channels<L: Lane, const N: usize>(
+pub(super) fn machine_channels<L: Lane, const A: usize, const B: usize, const Q: usize>(
     valve_ratio: f64,
     alpha: f64,
-    y: &Point<L, N>,
-    r: &Rates<L, N>,
+    y: &Point<L, A, B, Q>,
+    r: &Rates<L, A, B, Q>,
     lane: usize,
 ) -> [f64; MACHINE_CHANNELS] {
     [

@@ -1,7 +1,7 @@
 //! One Rosenbrock step of all lanes.
 
 use super::constants::Constants;
-use super::dynamics::{Point, Rates, Regime, evaluate};
+use super::dynamics::{Heading, LARGEST_TURN_RAD, PerMode, Point, Rates, Regime, evaluate};
 use super::lane::Lane;
 use super::solve::{Factors, factor, solve};
 use super::sums::sums;
@@ -9,24 +9,24 @@ use super::tableau::{STAGES, Tableau};
 
 /// Scratch of a step; may be dirty.
 #[derive(Debug, Clone)]
-pub(super) struct StepBuffer<L, const N: usize> {
+pub(super) struct StepBuffer<L, const A: usize, const B: usize, const Q: usize> {
     /// Right-hand side at the start of the step.
-    pub(super) start: Rates<L, N>,
+    pub(super) start: Rates<L, A, B, Q>,
     /// Right-hand side at the last stage.
-    pub(super) end: Rates<L, N>,
+    pub(super) end: Rates<L, A, B, Q>,
     /// State after the step.
-    pub(super) next: Point<L, N>,
+    pub(super) next: Point<L, A, B, Q>,
     /// dω/dt at the end of the step, from the dense output: the right-hand side there would show the
     /// small errors of the stiff modes multiplied by their stiffness.
     pub(super) alpha: L,
     /// Squared error estimate over tolerance-free scales.
     pub(super) error2: L,
-    factors: Factors<L, N>,
-    increments: [Point<L, N>; STAGES],
-    rhs: Point<L, N>,
+    factors: Factors<L, A, B, Q>,
+    increments: [Point<L, A, B, Q>; STAGES],
+    rhs: Point<L, A, B, Q>,
 }
 
-impl<L: Lane, const N: usize> StepBuffer<L, N> {
+impl<L: Lane, const A: usize, const B: usize, const Q: usize> StepBuffer<L, A, B, Q> {
     /// Zero everywhere.
     pub(super) fn new() -> Self {
         Self {
@@ -44,206 +44,248 @@ impl<L: Lane, const N: usize> StepBuffer<L, N> {
 
 /// Steps from `y` by `h`: fills `next`, `error2`, and the rates at both ends.
 #[inline(always)]
-pub(super) fn step<L: Lane, const N: usize, const A: usize>(
-    c: &Constants<N, A>,
+pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
     method: &Tableau,
-    y: &Point<L, N>,
+    y: &Point<L, A, B, Q>,
     h: L,
     regime: &Regime<L>,
-    w: &mut StepBuffer<L, N>,
+    w: &mut StepBuffer<L, A, B, Q>,
 ) {
-    let count = L::trip(N, c.used);
-    evaluate(c, y, regime.opening, regime, &mut w.start);
+    let heading = Heading::new(y.theta);
+    evaluate::<true, _, A, B, Q>(c, y, &heading, regime.opening, regime, &mut w.start);
     factor(c, y, &w.start, h * L::splat(method.gamma), &mut w.factors);
     let inverse_h = L::splat(1.0) / h;
+    let slopes = &w.start.slopes;
     let drift = [
-        h * regime.opening_per_s * w.start.gain[0] * w.start.stiffness[0],
-        h * regime.opening_per_s * w.start.gain[1] * w.start.stiffness[1],
+        h * regime.opening_per_s * slopes.gain[0] * slopes.stiffness[0],
+        h * regime.opening_per_s * slopes.gain[1] * slopes.stiffness[1],
     ];
     w.next = *y;
     for stage in 0..method.stages {
-        gather(method, stage, count, y, inverse_h, w);
+        gather(c, method, stage, y, inverse_h, w);
         let at = if stage == 0 {
             &w.start
         } else {
             let opening = regime.opening + L::splat(method.time[stage]) * h * regime.opening_per_s;
-            evaluate(c, &w.next, opening, regime, &mut w.end);
+            evaluate::<false, _, A, B, Q>(c, &w.next, &heading, opening, regime, &mut w.end);
             &w.end
         };
         w.rhs.theta += w.next.omega;
         w.rhs.omega += at.alpha;
-        for i in 0..count {
-            w.rhs.z[i] += w.next.v[i];
-            w.rhs.v[i] += at.a[i];
-        }
+        w.rhs.lag += at.lag;
         for i in 0..2 {
             w.rhs.p[i] += at.p[i] + L::splat(method.d[stage]) * drift[i];
         }
+        plus(c, &mut w.rhs.z, &w.next.v);
+        plus(c, &mut w.rhs.v, &at.a);
         solve(c, &w.factors, &w.start, &w.rhs, &mut w.increments[stage]);
     }
-    let last = w.increments[method.stages - 1];
-    add(count, &mut w.next, &last);
+    let last = &w.increments[method.stages - 1];
+    w.next.theta += last.theta;
+    w.next.omega += last.omega;
+    w.next.lag += last.lag;
+    for i in 0..2 {
+        w.next.p[i] += last.p[i];
+    }
+    plus(c, &mut w.next.z, &last.z);
+    plus(c, &mut w.next.v, &last.v);
     let mut change = w.next.omega - y.omega;
     for (u, slope) in w.increments[..method.stages].iter().zip(&method.slope) {
         change -= u.omega * L::splat(*slope);
     }
     w.alpha = change * inverse_h;
-    w.error2 = error2(c, &w.end, &last);
+    let turn = (w.next.theta - y.theta).abs();
+    // Not a number is not less either.
+    w.error2 = error2(c, w).where_less(turn, L::splat(LARGEST_TURN_RAD), L::splat(f64::INFINITY));
+}
+
+/// Adds `b` to `a`.
+#[inline(always)]
+fn plus<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    a: &mut PerMode<L, A, B, Q>,
+    b: &PerMode<L, A, B, Q>,
+) {
+    for i in 0..L::trip(A, c.coupled.used) {
+        a.coupled[i] += b.coupled[i];
+    }
+    for i in 0..L::trip(B, c.plain.used) {
+        a.plain[i] += b.plain[i];
+    }
+    for i in 0..L::trip(Q, c.follower.used) {
+        a.follower[i] += b.follower[i];
+    }
 }
 
 /// Argument of the stage into `next`, Σ c/h u into `rhs`.
 #[inline(always)]
-fn gather<L: Lane, const N: usize>(
+fn gather<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
     method: &Tableau,
     stage: usize,
-    count: usize,
-    y: &Point<L, N>,
+    y: &Point<L, A, B, Q>,
     inverse_h: L,
-    w: &mut StepBuffer<L, N>,
+    w: &mut StepBuffer<L, A, B, Q>,
 ) {
-    let (a, c) = (&method.a[stage], &method.c[stage]);
+    let (next, rhs) = (&mut w.next, &mut w.rhs);
     let u = &w.increments[..stage];
-    macro_rules! combine {
-        ($from:expr, $get:expr) => {{
-            let get = $get;
-            let mut argument = $from;
-            let mut carried = L::splat(0.0);
-            for (j, u) in u.iter().enumerate() {
-                let x: L = get(u);
-                argument += x * L::splat(a[j]);
-                carried += x * L::splat(c[j]);
-            }
-            (argument, carried * inverse_h)
-        }};
-    }
-    let chained = stage >= method.chain;
-    let (theta, rhs_theta) = combine!(y.theta, |u: &Point<L, N>| u.theta);
-    let (omega, rhs_omega) = combine!(y.omega, |u: &Point<L, N>| u.omega);
-    w.rhs.theta = rhs_theta;
-    w.rhs.omega = rhs_omega;
-    let previous = if chained { Some(&u[stage - 1]) } else { None };
-    w.next.theta = previous.map_or(theta, |u| w.next.theta + u.theta);
-    w.next.omega = previous.map_or(omega, |u| w.next.omega + u.omega);
-    for i in 0..2 {
-        let (p, rhs) = combine!(y.p[i], |u: &Point<L, N>| u.p[i]);
-        w.rhs.p[i] = rhs;
-        w.next.p[i] = previous.map_or(p, |u| w.next.p[i] + u.p[i]);
-    }
-    blocks(
-        a,
-        c,
-        u,
-        count,
+    let weights = Weights {
+        a: &method.a[stage],
+        c: &method.c[stage],
+        chained: stage >= method.chain,
         inverse_h,
-        |u| &u.z,
-        &y.z,
-        chained,
-        &mut w.next.z,
-        &mut w.rhs.z,
-    );
-    blocks(
-        a,
-        c,
-        u,
-        count,
-        inverse_h,
-        |u| &u.v,
-        &y.v,
-        chained,
-        &mut w.next.v,
-        &mut w.rhs.v,
-    );
-}
-
-/// The same for an array of modes, four at a time.
-#[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "an inlined piece of one loop")]
-fn blocks<L: Lane, const N: usize>(
-    a: &[f64; STAGES],
-    c: &[f64; STAGES],
-    u: &[Point<L, N>],
-    count: usize,
-    inverse_h: L,
-    get: impl Fn(&Point<L, N>) -> &[L; N],
-    from: &[L; N],
-    chained: bool,
-    argument: &mut [L; N],
-    carried: &mut [L; N],
-) {
-    let zero = L::splat(0.0);
-    let whole = count - count % 4;
-    let mut start = 0;
-    while start < whole {
-        let mut sum_a = [zero; 4];
-        let mut sum_c = [zero; 4];
-        for i in 0..4 {
-            sum_a[i] = from[start + i];
-        }
-        for (j, u) in u.iter().enumerate() {
-            let x = get(u);
-            for i in 0..4 {
-                sum_a[i] += x[start + i] * L::splat(a[j]);
-                sum_c[i] += x[start + i] * L::splat(c[j]);
-            }
-        }
-        for i in 0..4 {
-            argument[start + i] = if chained {
-                argument[start + i] + get(&u[u.len() - 1])[start + i]
-            } else {
-                sum_a[i]
-            };
-            carried[start + i] = sum_c[i] * inverse_h;
-        }
-        start += 4;
-    }
-    for i in whole..count {
-        let mut sum_a = from[i];
-        let mut sum_c = zero;
-        for (j, u) in u.iter().enumerate() {
-            let x = get(u)[i];
-            sum_a += x * L::splat(a[j]);
-            sum_c += x * L::splat(c[j]);
-        }
-        argument[i] = if chained {
-            argument[i] + get(&u[u.len() - 1])[i]
-        } else {
-            sum_a
+    };
+    let scalars = |p: &Point<L, A, B, Q>| [p.theta, p.omega, p.p[0], p.p[1]];
+    let (argument, carried) = weights.block(u, scalars(y), scalars(next), |u, k| match k {
+        0 => u.theta,
+        1 => u.omega,
+        2 => u.p[0],
+        _ => u.p[1],
+    });
+    [next.theta, next.omega, next.p[0], next.p[1]] = argument;
+    [rhs.theta, rhs.omega, rhs.p[0], rhs.p[1]] = carried;
+    let ([argument], [carried]) = weights.block(u, [y.lag], [next.lag], |u, _| u.lag);
+    (next.lag, rhs.lag) = (argument, carried);
+    macro_rules! array {
+        ($q:ident, $kind:ident, $size:ident) => {
+            weights.array(
+                L::trip($size, c.$kind.used),
+                u,
+                &y.$q.$kind,
+                &mut next.$q.$kind,
+                &mut rhs.$q.$kind,
+                |u| &u.$q.$kind,
+            );
         };
-        carried[i] = sum_c * inverse_h;
     }
+    array!(z, coupled, A);
+    array!(v, coupled, A);
+    array!(z, plain, B);
+    array!(v, plain, B);
+    array!(z, follower, Q);
+    array!(v, follower, Q);
 }
 
-#[inline(always)]
-fn add<L: Lane, const N: usize>(count: usize, y: &mut Point<L, N>, u: &Point<L, N>) {
-    y.theta += u.theta;
-    y.omega += u.omega;
-    for i in 0..count {
-        y.z[i] += u.z[i];
-        y.v[i] += u.v[i];
+/// Coefficients of one stage.
+struct Weights<'a, L> {
+    a: &'a [f64; STAGES],
+    c: &'a [f64; STAGES],
+    /// The argument is the previous one plus the previous increment.
+    chained: bool,
+    inverse_h: L,
+}
+
+impl<L: Lane> Weights<'_, L> {
+    /// Arguments and carried sums of `K` numbers.
+    #[inline(always)]
+    fn block<U, const K: usize>(
+        &self,
+        u: &[U],
+        from: [L; K],
+        previous: [L; K],
+        get: impl Fn(&U, usize) -> L,
+    ) -> ([L; K], [L; K]) {
+        let mut argument = from;
+        let mut carried = [L::splat(0.0); K];
+        if let (true, Some(last)) = (self.chained, u.last()) {
+            for (j, u) in u.iter().enumerate() {
+                let c = L::splat(self.c[j]);
+                for k in 0..K {
+                    carried[k] += get(u, k) * c;
+                }
+            }
+            for k in 0..K {
+                argument[k] = previous[k] + get(last, k);
+            }
+        } else {
+            for (j, u) in u.iter().enumerate() {
+                let (a, c) = (L::splat(self.a[j]), L::splat(self.c[j]));
+                for k in 0..K {
+                    let x = get(u, k);
+                    argument[k] += x * a;
+                    carried[k] += x * c;
+                }
+            }
+        }
+        for carried in &mut carried {
+            *carried = *carried * self.inverse_h;
+        }
+        (argument, carried)
     }
-    for i in 0..2 {
-        y.p[i] += u.p[i];
+
+    /// The same for the first `count` of an array, four at a time.
+    #[inline(always)]
+    fn array<U, const N: usize>(
+        &self,
+        count: usize,
+        u: &[U],
+        from: &[L; N],
+        argument: &mut [L; N],
+        carried: &mut [L; N],
+        get: impl Fn(&U) -> &[L; N],
+    ) {
+        macro_rules! block {
+            ($start:expr, $size:literal) => {
+                let start = $start;
+                let take = |x: &[L; N]| -> [L; $size] { std::array::from_fn(|k| x[start + k]) };
+                let (a, c) = self.block(u, take(from), take(argument), |u, k| get(u)[start + k]);
+                for k in 0..$size {
+                    argument[start + k] = a[k];
+                    carried[start + k] = c[k];
+                }
+            };
+        }
+        let whole = count - count % 4;
+        let mut at = 0;
+        while at < whole {
+            block!(at, 4);
+            at += 4;
+        }
+        match count % 4 {
+            0 => {}
+            1 => {
+                block!(whole, 1);
+            }
+            2 => {
+                block!(whole, 2);
+            }
+            _ => {
+                block!(whole, 3);
+            }
+        }
     }
 }
 
 /// Σ (error / scale)² over pressures, rod travel, rod speed and strain energy.
 #[inline(always)]
-fn error2<L: Lane, const N: usize, const A: usize>(
-    c: &Constants<N, A>,
-    r: &Rates<L, N>,
-    u: &Point<L, N>,
+fn error2<L: Lane, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<A, B, Q>,
+    w: &StepBuffer<L, A, B, Q>,
 ) -> L {
-    let count = L::trip(N, c.used);
     let k = |x: f64| L::splat(x);
-    let [jz, jv, energy] = sums(count, |i| {
-        [r.j[i] * u.z[i], r.j[i] * u.v[i], u.z[i] * u.z[i] * k(c.w2[i])]
+    // The last increment of a stiffly accurate method is the difference to the embedded one.
+    let u = &w.increments[w.increments.len() - 1];
+    let j = w.factors.lengths();
+    let a = sums!(L::trip(A, c.coupled.used), |i| {
+        let (z, v) = (u.z.coupled[i], u.v.coupled[i]);
+        [j.coupled[i] * z, j.coupled[i] * v, z * z * k(c.coupled.w2[i])]
     });
-    let travel = (jz + r.jt * u.theta) * k(c.scale.per_m);
-    let speed = (jv + r.jt * u.omega) * k(c.scale.per_m_per_s);
-    let turn = r.jt * u.theta * k(c.scale.per_m);
-    let spin = r.jt * u.omega * k(c.scale.per_m_per_s);
+    let b = sums!(L::trip(B, c.plain.used), |i| {
+        let (z, v) = (u.z.plain[i], u.v.plain[i]);
+        [j.plain[i] * z, j.plain[i] * v, z * z * k(c.plain.w2[i])]
+    });
+    let [follower] = sums!(L::trip(Q, c.follower.used), |i| {
+        let z = u.z.follower[i];
+        [z * z * k(c.follower.w2[i])]
+    });
+    let jt = w.start.jt;
+    let travel = (a[0] + b[0] + jt * u.theta) * k(c.scale.per_m);
+    let speed = (a[1] + b[1] + jt * u.omega) * k(c.scale.per_m_per_s);
+    let turn = jt * u.theta * k(c.scale.per_m);
+    let spin = jt * u.omega * k(c.scale.per_m_per_s);
     let p = [u.p[0] * k(c.scale.per_pa), u.p[1] * k(c.scale.per_pa)];
-    energy * k(c.scale.per_j)
+    (a[2] + b[2] + follower) * k(c.scale.per_j)
         + (travel * travel + speed * speed)
         + (turn * turn + spin * spin)
         + (p[0] * p[0] + p[1] * p[1])

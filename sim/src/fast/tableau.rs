@@ -2,36 +2,36 @@
 //! Jacobian: (1/(γ h) − J) uᵢ = f(y + Σ aᵢⱼ uⱼ) + Σ cᵢⱼ/h uⱼ + γᵢ h ∂f/∂t.
 
 /// Most stages of a method.
-pub(super) const STAGES: usize = 8;
+pub(crate) const STAGES: usize = 8;
 
 /// A stiffly accurate Rosenbrock method: the new state is the last stage's argument plus the last
 /// increment, which is also the error estimate.
 #[derive(Debug)]
-pub(super) struct Tableau {
+pub(crate) struct Tableau {
     /// Stages in use.
-    pub(super) stages: usize,
+    pub(crate) stages: usize,
     /// First stage whose argument is the previous stage's argument plus its increment.
-    pub(super) chain: usize,
+    pub(crate) chain: usize,
     /// γ.
-    pub(super) gamma: f64,
+    pub(crate) gamma: f64,
     /// aᵢⱼ.
-    pub(super) a: [[f64; STAGES]; STAGES],
+    pub(crate) a: [[f64; STAGES]; STAGES],
     /// cᵢⱼ.
-    pub(super) c: [[f64; STAGES]; STAGES],
+    pub(crate) c: [[f64; STAGES]; STAGES],
     /// Times of the stages over the step.
-    pub(super) time: [f64; STAGES],
+    pub(crate) time: [f64; STAGES],
     /// γᵢ.
-    pub(super) d: [f64; STAGES],
+    pub(crate) d: [f64; STAGES],
     /// Σᵣ hᵣⱼ of the dense output: its derivative at the end of the step is
     /// (y₁ − y₀ − Σ slopeⱼ uⱼ)/h.
-    pub(super) slope: [f64; STAGES],
+    pub(crate) slope: [f64; STAGES],
 }
 
 /// Rodas5P: order 5 with an estimate of order 4, 8 stages. Steinebach, *Construction of
 /// Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia differential equations
 /// package*, BIT Numerical Mathematics 63 (2023), table 1.
 #[rustfmt::skip]
-pub(super) static RODAS5P: Tableau = Tableau {
+pub(crate) static RODAS5P: Tableau = Tableau {
     stages: 8,
     chain: 6,
     gamma: 0.211_937_563_194_290_14,

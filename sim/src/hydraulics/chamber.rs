@@ -4,7 +4,7 @@ use std::f64::consts::FRAC_PI_4;
 
 use hydroflex_openapi::machine::{CylinderSpec, ValveSpec};
 
-use super::valve::{flow_m3_per_s, implicit_pressure};
+use super::valve::{flow_m3_per_s, implicit_pressure, signed_sqrt};
 
 /// Which chamber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,6 +47,24 @@ pub struct ChamberStep {
     /// ∂p/∂ẋ, Pa s/m.
     pub by_velocity: f64,
 }
+
+/// Rate of a chamber's pressure, and its derivatives.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ChamberRate {
+    /// Pa/s.
+    pub rate_pa_per_s: f64,
+    /// ∂ṗ/∂p, 1/s.
+    pub by_pressure: f64,
+    /// ∂ṗ/∂x, Pa/(s m).
+    pub by_stroke: f64,
+    /// ∂ṗ/∂ẋ, Pa/m.
+    pub by_velocity: f64,
+    /// ∂ṗ/∂U, Pa/s.
+    pub by_valve: f64,
+}
+
+/// Root of the pressure drop below which the slope of the flow is taken as that at this root, √Pa.
+const ROOT_LEAST: f64 = 30.0;
 
 impl Chamber {
     /// The chamber of a cylinder.
@@ -115,6 +133,43 @@ impl Chamber {
             rate.max(0.0)
         } else {
             rate
+        }
+    }
+
+    /// ṗ of a filled chamber and its derivatives, while the valve's signal keeps the sign that `extends` says (true: the
+    /// piston side is fed), zero included.
+    #[inline]
+    #[must_use]
+    pub fn rate_and_slopes(
+        &self,
+        valve: &ValveSpec,
+        valve_ratio: f64,
+        extends: bool,
+        stroke_m: f64,
+        velocity_m_per_s: f64,
+        pressure_pa: f64,
+    ) -> ChamberRate {
+        // A full opening's flow at the drop over the edge that this sign opens.
+        let is_fed = extends == (self.sign > 0.0);
+        let drop = if is_fed {
+            valve.supply_pressure_pa - pressure_pa
+        } else {
+            valve.tank_pressure_pa - pressure_pa
+        };
+        let root = signed_sqrt(drop) * valve.flow_coefficient_m3_per_s_per_sqrt_pa;
+        let direction = if extends { 1.0 } else { -1.0 };
+        let opening = (direction * valve_ratio).max(0.0);
+        let compliance = self.compliance_m3_per_pa(stroke_m);
+        let rate = (opening * root - self.sign * self.area_m2 * velocity_m_per_s) / compliance;
+        // The slope of the root is unbounded at zero drop; a bound there costs accuracy only.
+        let root_slope =
+            0.5 * valve.flow_coefficient_m3_per_s_per_sqrt_pa / drop.abs().sqrt().max(ROOT_LEAST);
+        ChamberRate {
+            rate_pa_per_s: rate,
+            by_pressure: -opening * root_slope / compliance,
+            by_stroke: -rate * self.compliance_slope_m2_per_pa / compliance,
+            by_velocity: -self.sign * self.area_m2 / compliance,
+            by_valve: direction * root / compliance,
         }
     }
 
@@ -197,6 +252,7 @@ pub(crate) mod tests {
             friction: FrictionSpec::None,
             parallel_spring: None,
             end_stop: None,
+            start_length_m: None,
             stroke_cutoff: None,
             initial_pressure_pa: 1e7,
         }

@@ -7,7 +7,7 @@ mod step;
 mod update;
 
 pub use scheme::Scheme;
-pub use step::{StepError, Stepper};
+pub use step::{Newton, StepError, Stepper};
 pub(crate) use update::{Increment, add_increment, normalise};
 
 #[cfg(test)]

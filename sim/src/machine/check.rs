@@ -278,6 +278,10 @@ impl Checker<'_> {
                 },
             ));
         }
+        if let Some(range) = c.start_length_m {
+            let stroke = (c.closed_length_m, c.closed_length_m + c.stroke_m);
+            self.ascending(&key("start_length_m"), range, stroke, "m")?;
+        }
         if let Some(cutoff) = c.stroke_cutoff {
             let range = [cutoff.min_length_m, cutoff.max_length_m];
             self.ascending(&key("stroke_cutoff"), range, (0.0, 200.0), "m")?;
@@ -453,6 +457,20 @@ impl Checker<'_> {
                     minus,
                     angles[..i].iter().map(|a: &AngleSpec| a.name.as_str()),
                 ));
+            }
+            for (k, other) in angle.instead.iter().enumerate() {
+                let at = format!("{at}.instead[{k}]");
+                if !angles[..i].iter().any(|earlier| earlier.name == other.angle) {
+                    let names = angles[..i].iter().map(|a: &AngleSpec| a.name.as_str());
+                    return Err(self.unknown(&format!("{at}.angle"), "earlier angle", &other.angle, names));
+                }
+                self.ascending(
+                    &format!("{at}.between_deg"),
+                    other.between_deg,
+                    (-360.0, 360.0),
+                    "°",
+                )?;
+                self.ascending(&format!("{at}.range_deg"), other.range_deg, (-360.0, 360.0), "°")?;
             }
         }
         Ok(())

@@ -222,7 +222,9 @@ pub enum Problem {
     #[error("the axis has no length")]
     NoAxis,
     /// No mesh was given.
-    #[error("body `{body}` needs a mesh: {what}; give it with --mesh FILE or --mesh {body}=FILE")]
+    #[error(
+        "body `{body}` needs a mesh: {what}; give it with --mesh {body}=FILE, over REST with POST /v1/meshes and the job's `meshes`"
+    )]
     MeshNotGiven {
         /// Body.
         body: String,
@@ -238,7 +240,7 @@ pub enum Problem {
         known: Vec<&'static str>,
     },
     /// A machine text from outside may not name files.
-    #[error("a machine sent as text cannot name a file; use a built-in mesh ({})", known.join(", "))]
+    #[error("a machine sent as text cannot name a file; upload the mesh and name it in the job's `meshes`, or use a built-in one ({})", known.join(", "))]
     FileNotAllowed {
         /// Names of built-in meshes.
         known: Vec<&'static str>,

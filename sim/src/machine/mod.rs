@@ -19,6 +19,7 @@ use crate::reduction::{ReducedBody, ReductionError, cached};
 use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use text::MachineText;
 
@@ -44,9 +45,13 @@ enum MeshAccess<'a> {
         folder: &'a Path,
         given: Vec<MeshArgument>,
     },
-    /// Text from outside: meshes that the binary carries, and nothing else.
-    BuiltInOnly,
+    /// Text from outside: meshes that the binary carries or that came as text themselves, by body;
+    /// and nothing else.
+    Texts(&'a MeshTexts),
 }
+
+/// Abaqus texts of meshes by the name of their body.
+pub type MeshTexts = BTreeMap<String, String>;
 
 impl Machine {
     /// Loads a built-in machine by name, or a TOML file by path. `meshes` are `FILE` or
@@ -77,12 +82,26 @@ impl Machine {
     }
 
     /// A machine from text that came from outside, such as a request: it may use built-in meshes
-    /// only, and can name no path.
+    /// and those given as text, and can name no path.
     ///
     /// # Errors
     /// [`MachineError`].
-    pub fn from_untrusted_toml(text: &str) -> Result<Self, MachineError> {
-        Self::build("machine", text, &MeshAccess::BuiltInOnly)
+    pub fn from_untrusted_toml(text: &str, meshes: &MeshTexts) -> Result<Self, MachineError> {
+        Self::build("machine", text, &MeshAccess::Texts(meshes))
+    }
+
+    /// A built-in machine with meshes that came from outside as text.
+    ///
+    /// # Errors
+    /// [`MachineError`].
+    pub fn built_in(name: &str, meshes: &MeshTexts) -> Result<Self, MachineError> {
+        match built_in::MACHINES.iter().find(|m| m.name == name) {
+            Some(machine) => Self::build(machine.name, machine.text, &MeshAccess::Texts(meshes)),
+            None => Err(MachineError::Unknown {
+                name: name.to_owned(),
+                built_in: Self::built_in_names(),
+            }),
+        }
     }
 
     /// A machine from trusted text; mesh files are relative to the working directory.
@@ -226,9 +245,6 @@ fn parse_mesh_arguments(arguments: &[String]) -> Vec<MeshArgument> {
 }
 
 fn check_mesh_arguments(file: &MachineFile, access: &MeshAccess<'_>) -> Result<(), MachineError> {
-    let MeshAccess::Local { given, .. } = access else {
-        return Ok(());
-    };
     let flexible = |wants: fn(&MeshSource) -> bool| -> Vec<String> {
         file.bodies
             .iter()
@@ -239,6 +255,21 @@ fn check_mesh_arguments(file: &MachineFile, access: &MeshAccess<'_>) -> Result<(
             .collect()
     };
     let all = flexible(|_| true);
+    let given = match access {
+        MeshAccess::Local { given, .. } => given,
+        MeshAccess::Texts(texts) => {
+            return match texts.keys().find(|body| !all.contains(body)) {
+                None => Ok(()),
+                Some(body) => Err(MachineError::MeshArgument {
+                    argument: body.clone(),
+                    problem: MeshArgumentProblem::UnknownBody {
+                        body: body.clone(),
+                        known: all,
+                    },
+                }),
+            };
+        }
+    };
     let wanting = flexible(|mesh| matches!(mesh, MeshSource::Given(_)));
     let mut seen: Vec<&str> = Vec::new();
     for argument in given {
@@ -297,6 +328,11 @@ fn mesh_text(
             return read(argument.path.clone());
         }
     }
+    if let MeshAccess::Texts(texts) = access
+        && let Some(text) = texts.get(body)
+    {
+        return Ok((format!("mesh of body {body:?}"), Cow::Owned(text.clone())));
+    }
     match (source, access) {
         (MeshSource::BuiltIn(name), _) => match built_in::mesh(name) {
             Some(text) => Ok((name.clone(), Cow::Borrowed(text))),
@@ -305,11 +341,11 @@ fn mesh_text(
                 known: built_in::mesh_names(),
             }),
         },
-        (_, MeshAccess::BuiltInOnly) => Err(Problem::FileNotAllowed {
+        (MeshSource::File(_), MeshAccess::Texts(_)) => Err(Problem::FileNotAllowed {
             known: built_in::mesh_names(),
         }),
         (MeshSource::File(path), MeshAccess::Local { folder, .. }) => read(folder.join(path)),
-        (MeshSource::Given(what), MeshAccess::Local { .. }) => Err(Problem::MeshNotGiven {
+        (MeshSource::Given(what), _) => Err(Problem::MeshNotGiven {
             body: body.to_owned(),
             what: what.clone(),
         }),

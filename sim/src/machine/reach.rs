@@ -46,6 +46,19 @@ impl Machine {
         Some((eye - self.attachment_point_m(ground)?).norm())
     }
 
+    /// The same for angles as a run table gives them. `None` where that needs the assembly.
+    #[must_use]
+    pub fn start_length_m(&self, cylinder: &CylinderSpec, angles_rad: &[f64]) -> Option<f64> {
+        let angles = &self.file.angles;
+        let index = angles
+            .iter()
+            .position(|a| a.body == cylinder.rod.body || a.body == cylinder.base.body)?;
+        let minus = angles[index].minus.as_ref();
+        let other = minus.and_then(|name| angles.iter().position(|a| &a.name == name));
+        let subtracted = other.map_or(Some(0.0), |k| angles_rad.get(k).copied())?;
+        self.undeformed_length_m(cylinder, angles_rad.get(index)? - subtracted)
+    }
+
     /// Refuses ranges of angles that leave a cylinder's stroke.
     pub(super) fn check_reach(&self, text: &MachineText<'_>) -> Result<(), MachineError> {
         for (i, angle) in self.file.angles.iter().enumerate() {

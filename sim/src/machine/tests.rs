@@ -22,7 +22,7 @@ fn refusal(from: &str, to: &str) -> String {
 
 /// Refusal of the built-in machine after an edit, with its mesh.
 fn refusal_on_mesh(from: &str, to: &str) -> String {
-    match Machine::from_untrusted_toml(&edited(BUILT_IN, from, to)) {
+    match Machine::from_untrusted_toml(&edited(BUILT_IN, from, to), &MeshTexts::new()) {
         Ok(_) => format!("accepted: {to}"),
         Err(error) => error.to_string(),
     }
@@ -299,12 +299,19 @@ fn the_built_in_boom_is_a_credible_crane_boom() {
 
 #[test]
 fn hashes_follow_the_content() {
-    let hash = |text: &str| Machine::from_untrusted_toml(text).unwrap().content_hash();
+    let hash = |text: &str| {
+        Machine::from_untrusted_toml(text, &MeshTexts::new())
+            .unwrap()
+            .content_hash()
+    };
     let other = edited(BUILT_IN, "stroke_m = 0.535", "stroke_m = 0.536");
     assert_eq!(hash(BUILT_IN), hash(BUILT_IN));
     assert_ne!(hash(BUILT_IN), hash(&other));
     let key = |text: &str, payload| {
-        Machine::from_untrusted_toml(text).unwrap().flexible_bodies()[0].reduction_key(payload)
+        Machine::from_untrusted_toml(text, &MeshTexts::new())
+            .unwrap()
+            .flexible_bodies()[0]
+            .reduction_key(payload)
     };
     // the cylinder is no part of the boom; its density, and the payload interface, are
     assert_eq!(key(BUILT_IN, false), key(&other, false));

@@ -207,7 +207,7 @@ fn visit_value<'a, 't>(
 }
 
 /// Lists of fixed length.
-const LIST_LENGTHS: [(&str, usize); 9] = [
+const LIST_LENGTHS: [(&str, usize); 11] = [
     ("gravity_m_per_s2", 3),
     ("axis_start_m", 3),
     ("axis_end_m", 3),
@@ -217,6 +217,8 @@ const LIST_LENGTHS: [(&str, usize); 9] = [
     ("inertia_kg_m2", 6),
     ("range_deg", 2),
     ("range_kg", 2),
+    ("between_deg", 2),
+    ("start_length_m", 2),
 ];
 
 /// The unknown key and the allowed ones, from either of the parser's two ways to say so.

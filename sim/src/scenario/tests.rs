@@ -36,10 +36,10 @@ fn the_same_seed_stays_the_same_bytes() {
         machine(),
     );
     let runs: Vec<String> = [0, 1, 79]
-        .map(|run| fingerprint(&plan_run(&spec, &machine, run).unwrap()))
+        .map(|run| fingerprint(&plan_run(&spec, &machine, &Anywhere, run).unwrap()))
         .to_vec();
     assert_eq!(runs, ["c2532926e20abffe", "43d5c25ddee73837", "9da897496825acc5"]);
-    let settling = fingerprint(&plan_settling_run(&spec, &machine, 7).unwrap());
+    let settling = fingerprint(&plan_settling_run(&spec, &machine, &Anywhere, 7).unwrap());
     assert_eq!(settling, "72522ddbe7ea4c9a");
 }
 
@@ -53,10 +53,10 @@ fn a_plan_keeps_to_its_ranges_and_does_not_know_its_neighbours() {
         ..small.clone()
     };
     let runs: Vec<RunInput> = (0..80)
-        .map(|run| plan_run(&small, &machine, run).unwrap())
+        .map(|run| plan_run(&small, &machine, &Anywhere, run).unwrap())
         .collect();
     for (index, run) in runs.iter().enumerate() {
-        assert_eq!(*run, plan_run(&large, &machine, index as u64).unwrap());
+        assert_eq!(*run, plan_run(&large, &machine, &Anywhere, index as u64).unwrap());
         assert_eq!(run.valves_ratio.len(), machine.cylinders.len());
         assert_eq!(run.valves_ratio[0].len(), 200);
         assert!((10.0..90.0).contains(&run.payload_kg));
@@ -66,7 +66,7 @@ fn a_plan_keeps_to_its_ranges_and_does_not_know_its_neighbours() {
     let mean = runs.iter().map(|run| run.payload_kg).sum::<f64>() / 80.0;
     assert!((mean - 50.0).abs() < 10.4, "{mean}");
     assert!(matches!(
-        plan_run(&small, &machine, 80),
+        plan_run(&small, &machine, &Anywhere, 80),
         Err(ScenarioError::Index { index: 80, runs: 80 })
     ));
 }
@@ -74,11 +74,14 @@ fn a_plan_keeps_to_its_ranges_and_does_not_know_its_neighbours() {
 #[test]
 fn settling_runs_open_the_valve_for_a_fifth_of_at_least_a_second() {
     let (machine, short) = (machine(), job(r#"{"runs": 1, "duration_s": 0.25}"#));
-    let run = plan_settling_run(&short, &machine, 0).unwrap();
+    let run = plan_settling_run(&short, &machine, &Anywhere, 0).unwrap();
     let signal = &run.valves_ratio[0];
     assert_eq!(signal.len(), 200);
     assert_eq!(signal.iter().rposition(|&u| u == 1.0), Some(39));
-    assert_ne!(run.angles_rad, plan_run(&short, &machine, 0).unwrap().angles_rad);
+    assert_ne!(
+        run.angles_rad,
+        plan_run(&short, &machine, &Anywhere, 0).unwrap().angles_rad
+    );
     assert_eq!(settling_steps(&job(r#"{"runs": 1, "duration_s": 10.0}"#)), 400);
 }
 
@@ -180,4 +183,61 @@ fn every_field_is_looked_at() {
     ] {
         assert_eq!(pointers(json), [pointer], "{json}");
     }
+}
+
+/// Starts where the first angle is below 10°.
+struct Low;
+
+impl Reach for Low {
+    fn can_start(&self, _: bool, angles_rad: &[f64]) -> bool {
+        angles_rad[0] < 10.0_f64.to_radians()
+    }
+}
+
+#[test]
+fn configurations_out_of_reach_are_drawn_again() {
+    let (machine, spec) = (machine(), job(r#"{"runs": 400, "seed": 3}"#));
+    for run in 0..400 {
+        let (any, low) = (
+            plan_run(&spec, &machine, &Anywhere, run).unwrap(),
+            plan_run(&spec, &machine, &Low, run).unwrap(),
+        );
+        assert!(low.angles_rad[0] < 10.0_f64.to_radians());
+        // What fits is kept, so that a looser limit changes no run that it already allowed.
+        if any.angles_rad[0] < 10.0_f64.to_radians() {
+            assert_eq!(any, low);
+        }
+        assert_eq!(any.valves_ratio, low.valves_ratio);
+        assert_eq!(low, plan_run(&spec, &machine, &Low, run).unwrap());
+    }
+    // A third of −10°..50°: 400 draws scatter by 0.024.
+    let part = reachable_part(&spec, &machine, &Low, 400);
+    assert!((part - 1.0 / 3.0).abs() < 0.12, "{part}");
+}
+
+#[test]
+fn a_range_can_depend_on_another_angle() {
+    let mut machine = machine();
+    let mut second = machine.angles[0].clone();
+    second.name = "second".to_owned();
+    second.range_deg = [0.0, 10.0];
+    second.instead = vec![hydroflex_openapi::machine::InsteadSpec {
+        angle: machine.angles[0].name.clone(),
+        between_deg: [25.0, 50.0],
+        range_deg: [-22.5, -20.0],
+    }];
+    machine.angles.push(second);
+    let spec = job(r#"{"runs": 200, "seed": 4}"#);
+    let mut seen = [0; 2];
+    for run in 0..200 {
+        let angles = plan_run(&spec, &machine, &Anywhere, run).unwrap().angles_rad;
+        let (first, second) = (angles[0].to_degrees(), angles[1].to_degrees());
+        if first > 25.0 {
+            assert!((-22.5..=-20.0).contains(&second), "{first} {second}");
+        } else {
+            assert!((0.0..=10.0).contains(&second), "{first} {second}");
+        }
+        seen[usize::from(first > 25.0)] += 1;
+    }
+    assert!(seen[0] > 50 && seen[1] > 50, "{seen:?}");
 }

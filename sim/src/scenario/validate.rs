@@ -150,12 +150,16 @@ fn angles(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
             );
             continue;
         };
-        let [min, max] = angle.range_deg;
+        let allowed = || std::iter::once(angle.range_deg).chain(angle.instead.iter().map(|i| i.range_deg));
+        let listed: Vec<String> = allowed().map(|[min, max]| format!("{min} to {max}")).collect();
         errors.require(
-            min <= range[0] && range[0] <= range[1] && range[1] <= max,
+            range[0] <= range[1] && allowed().any(|[min, max]| min <= range[0] && range[1] <= max),
             pointer,
             range,
-            format!("[from, to] within {min} to {max} degrees, from not above to"),
+            format!(
+                "[from, to] within {} degrees, from not above to",
+                listed.join(", or ")
+            ),
         );
     }
 }

@@ -73,16 +73,53 @@ impl DenseLu {
             right.swap(k, self.pivots[k]);
         }
         for i in 0..n {
-            let row = &self.values[i * n..i * n + i];
-            let sum: f64 = row.iter().zip(right.iter()).map(|(a, b)| a * b).sum();
-            right[i] -= sum;
+            right[i] -= dot(&self.values[i * n..i * n + i], &right[..i]);
         }
         for i in (0..n).rev() {
             let row = &self.values[i * n..(i + 1) * n];
-            let sum: f64 = row[i + 1..].iter().zip(&right[i + 1..]).map(|(a, b)| a * b).sum();
-            right[i] = (right[i] - sum) / row[i];
+            right[i] = (right[i] - dot(&row[i + 1..], &right[i + 1..])) / row[i];
         }
     }
+
+    /// Solves with the transposed matrix, in place.
+    pub fn solve_transposed(&self, right: &mut [f64]) {
+        let n = self.order;
+        debug_assert_eq!(right.len(), n);
+        for i in 0..n {
+            let x = right[i] / self.values[i * n + i];
+            right[i] = x;
+            for j in i + 1..n {
+                right[j] -= self.values[i * n + j] * x;
+            }
+        }
+        for i in (0..n).rev() {
+            let x = right[i];
+            for j in 0..i {
+                right[j] -= self.values[i * n + j] * x;
+            }
+        }
+        for k in (0..n).rev() {
+            right.swap(k, self.pivots[k]);
+        }
+    }
+}
+
+/// Sum of products in four strands: one strand would wait for every addition.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut strands = [0.0; 4];
+    let (a4, b4) = (a.chunks_exact(4), b.chunks_exact(4));
+    let rest: f64 = a4
+        .remainder()
+        .iter()
+        .zip(b4.remainder())
+        .map(|(x, y)| x * y)
+        .sum();
+    for (x, y) in a4.zip(b4) {
+        for k in 0..4 {
+            strands[k] += x[k] * y[k];
+        }
+    }
+    (strands[0] + strands[1]) + (strands[2] + strands[3]) + rest
 }
 
 #[cfg(test)]
@@ -111,6 +148,29 @@ mod tests {
         lu.solve(&mut right);
         for (a, b) in right.iter().zip(&x) {
             assert!((a - b).abs() < 1e-12, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn solves_with_the_transposed_matrix() {
+        let n = 6;
+        // Large beside the diagonal, so that rows are exchanged.
+        let entry = |i: usize, j: usize| {
+            let large = if j == (i + 2) % n { 4.0 } else { 0.0 };
+            large + ((5 * i + 3 * j * j + 1) as f64 * 0.61).cos()
+        };
+        let mut lu = DenseLu::new(n);
+        for i in 0..n {
+            for j in 0..n {
+                lu.values[i * n + j] = entry(i, j);
+            }
+        }
+        let x: Vec<f64> = (0..n).map(|i| 1.5 - i as f64).collect();
+        let mut right: Vec<f64> = (0..n).map(|i| (0..n).map(|j| entry(j, i) * x[j]).sum()).collect();
+        assert!(lu.factorise());
+        lu.solve_transposed(&mut right);
+        for (a, b) in right.iter().zip(&x) {
+            assert!((a - b).abs() < 1e-11, "{a} {b}");
         }
     }
 

@@ -69,6 +69,8 @@ pub enum SolverPath {
     General,
     /// Minimal coordinates of one boom that moves in its plane.
     Planar,
+    /// Free coordinates of a tree of bodies with loops, all in one plane.
+    Tree,
 }
 
 impl SolverPath {
@@ -78,6 +80,7 @@ impl SolverPath {
         match self {
             Self::General => "general",
             Self::Planar => "planar",
+            Self::Tree => "planar_tree",
         }
     }
 }

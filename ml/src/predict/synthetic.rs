@@ -1,0 +1,418 @@
+//! Models with random weights: for benchmarks and tests of whatever serves models, where how well
+//! a model estimates does not matter and a training would only take time.
+
+use super::Predictor;
+use crate::model::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
+use crate::model::{ModelError, write};
+use crate::network::init::initial_parameters;
+use crate::structure::{Structure, StructureError};
+use hydroflex_openapi::model::{DenseLayer, GoldenPrediction, ModelConfig};
+use serde_json::json;
+use std::path::Path;
+
+/// Channels in, with a typical value and its variation.
+const INPUTS: [(&str, &str, f64, f64); 5] = [
+    ("valve_lift_ratio", "1", 0.0, 0.5),
+    ("length_lift_m", "m", 1.05, 0.1),
+    ("velocity_lift_m_per_s", "m/s", 0.0, 0.05),
+    ("pressure_lift_piston_pa", "Pa", 5e6, 2e6),
+    ("pressure_lift_rod_pa", "Pa", 4e6, 2e6),
+];
+/// Channels out.
+const TARGETS: [(&str, &str, f64, f64); 3] = [
+    ("deflection_tip_y_m", "m", -2e-3, 1e-3),
+    ("strain_tip_xy", "1", 0.0, 1e-5),
+    ("stress_root_xx_pa", "Pa", 1e7, 5e6),
+];
+const SAMPLE_TIME_S: f64 = 0.005;
+/// Directions of the envelope.
+const ENVELOPE_COMPONENTS: usize = 24;
+
+/// What to make.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SyntheticSpec {
+    /// As in a training: `best`, `RLR`, …
+    pub structure: String,
+    /// Samples in a window of the five usual sensors.
+    pub window_steps: usize,
+    /// Channels out, at most three.
+    pub targets: usize,
+    /// Of the weights.
+    pub seed: u64,
+}
+
+/// A model's parts.
+#[derive(Debug, Clone)]
+pub struct SyntheticModel {
+    /// Configuration, with intervals, envelope and golden predictions.
+    pub config: ModelConfig,
+    /// Weights.
+    pub weights: Weights,
+    /// Envelope.
+    pub auxiliary: Auxiliary,
+}
+
+impl SyntheticModel {
+    /// Random weights, the same for the same specification.
+    ///
+    /// # Errors
+    /// An unknown structure.
+    ///
+    /// # Panics
+    /// Without a window or targets, or with more targets than three.
+    pub fn new(spec: &SyntheticSpec) -> Result<Self, StructureError> {
+        assert!(
+            spec.window_steps > 0 && (1..=TARGETS.len()).contains(&spec.targets),
+            "a window and one to three targets"
+        );
+        let structure = Structure::parse(&spec.structure, spec.window_steps, None)?;
+        let values = spec.window_steps * INPUTS.len();
+        let layers = structure.layers(values, spec.targets);
+        let weights = Weights {
+            layers: random(&layers, spec.seed),
+            skip: structure
+                .linear_skip
+                .then(|| in_f64(&random(&[map("skip", values, spec.targets)], spec.seed + 1).remove(0))),
+        };
+        let linear = random(
+            &[
+                map("least_squares", values, spec.targets),
+                map("quasi_static", INPUTS.len(), spec.targets),
+                map("envelope", values, ENVELOPE_COMPONENTS),
+            ],
+            spec.seed + 2,
+        );
+        let [least_squares, quasi_static, envelope] = <[LinearWeights; 3]>::try_from(linear)
+            .unwrap_or_else(|maps| unreachable!("three maps were asked for, not {}", maps.len()));
+        let auxiliary = Auxiliary {
+            least_squares,
+            quasi_static,
+            envelope: Some(envelope),
+        };
+        let mut config = config(spec, structure.linear_skip, &layers);
+        let predictor = Predictor::new(&config, &weights, &auxiliary);
+        let mut workspace = predictor.workspace();
+        config.golden = (0..3)
+            .map(|number| {
+                let window = signal(number * spec.window_steps, spec.window_steps);
+                let mut estimates = vec![0.0; spec.targets];
+                predictor.predict_window(&window, &mut estimates, &mut workspace);
+                GoldenPrediction { window, estimates }
+            })
+            .collect();
+        Ok(Self {
+            config,
+            weights,
+            auxiliary,
+        })
+    }
+
+    /// Ready to estimate.
+    #[must_use]
+    pub fn predictor(&self) -> Predictor {
+        Predictor::new(&self.config, &self.weights, &self.auxiliary)
+    }
+
+    /// Writes the model folder, replacing what is there.
+    ///
+    /// # Errors
+    /// A file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
+        write::write_parts(&self.config, &self.weights, &self.auxiliary, folder)
+    }
+}
+
+/// A smooth signal of all inputs: `rows` samples from sample `first` on, row by row.
+#[must_use]
+pub fn signal(first: usize, rows: usize) -> Vec<f64> {
+    (first..first + rows)
+        .flat_map(|row| {
+            let t = row as f64 * SAMPLE_TIME_S;
+            INPUTS.iter().enumerate().map(move |(i, (_, _, mean, size))| {
+                mean + size * ((1.3 + i as f64) * t + 0.7 * i as f64).sin()
+            })
+        })
+        .collect()
+}
+
+fn map(name: &str, inputs: usize, outputs: usize) -> DenseLayer {
+    DenseLayer {
+        name: name.to_owned(),
+        inputs,
+        outputs,
+        activations: Vec::new(),
+    }
+}
+
+fn random(layers: &[DenseLayer], seed: u64) -> Vec<LinearWeights> {
+    let parameters = initial_parameters(layers, seed, 1.0);
+    let mut rest = parameters.as_slice();
+    layers
+        .iter()
+        .map(|layer| {
+            let (weight, after) = rest.split_at(layer.inputs * layer.outputs);
+            let (bias, after) = after.split_at(layer.outputs);
+            rest = after;
+            LinearWeights {
+                weight: weight.to_vec(),
+                bias: bias.to_vec(),
+            }
+        })
+        .collect()
+}
+
+fn in_f64(map: &LinearWeights) -> SkipWeights {
+    SkipWeights {
+        weight: map.weight.iter().map(|&w| f64::from(w)).collect(),
+        bias: map.bias.iter().map(|&b| f64::from(b)).collect(),
+    }
+}
+
+fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> ModelConfig {
+    let channels = |all: &[(&str, &str, f64, f64)]| -> Vec<serde_json::Value> {
+        all.iter()
+            .map(|(name, unit, offset, scale)| {
+                json!({"name": name, "unit": unit, "offset": offset, "scale": scale})
+            })
+            .collect()
+    };
+    let targets = &TARGETS[..spec.targets];
+    let half_widths: Vec<serde_json::Value> = targets
+        .iter()
+        .map(|(_, _, offset, scale)| {
+            json!({
+                "centre": offset, "upper_edges": [0.1 * scale],
+                "half_widths": [0.01 * scale, 0.02 * scale],
+            })
+        })
+        .collect();
+    let bounds = |sign: f64| -> Vec<f64> {
+        INPUTS
+            .iter()
+            .map(|(_, _, mean, size)| mean + sign * 1.5 * size)
+            .collect()
+    };
+    // Through JSON: what a later version adds to the configuration has a default there.
+    let value = json!({
+        "format_version": hydroflex_openapi::model::MODEL_FORMAT_VERSION,
+        "structure": spec.structure,
+        "window_steps": spec.window_steps,
+        "window_s": spec.window_steps as f64 * SAMPLE_TIME_S,
+        "sample_time_s": SAMPLE_TIME_S,
+        "inputs": channels(&INPUTS),
+        "targets": channels(targets),
+        "linear_skip": linear_skip,
+        "layers": layers,
+        "provenance": {
+            "spec": {"structure": spec.structure, "seed": spec.seed},
+            "dataset_sha256": "0".repeat(64),
+            "train_runs": 0, "validation_runs": 0, "train_windows": 0,
+            "epochs": 0, "best_epoch": 0, "learning_rate": 0.0, "batch": 0,
+            "history": [], "ended_by": "epochs",
+            "hydroflex_version": env!("CARGO_PKG_VERSION"), "burn_version": "none",
+        },
+        "validation": [],
+        "validation_least_squares": [],
+        "intervals": half_widths,
+        "envelope": {
+            "components": ENVELOPE_COMPONENTS,
+            "groups": [{ "components": ENVELOPE_COMPONENTS, "limit": 1e3 }],
+            "min": bounds(-1.0), "max": bounds(1.0),
+        },
+        "golden": [],
+    });
+    serde_json::from_value(value)
+        .unwrap_or_else(|error| unreachable!("a configuration with every required field: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sliding::SlidingWindow;
+    use super::*;
+
+    fn model(structure: &str) -> SyntheticModel {
+        SyntheticModel::new(&SyntheticSpec {
+            structure: structure.to_owned(),
+            window_steps: 12,
+            targets: 3,
+            seed: 7,
+        })
+        .unwrap()
+    }
+
+    #[test]
+    fn a_written_model_loads_and_a_changed_weight_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model");
+        let mut model = model("best");
+        model.write(&path).unwrap();
+        crate::model::Model::load(&path).unwrap();
+        // Right hashes, wrong weights: only the golden predictions can tell.
+        model.weights.layers[0].bias[0] += 0.1;
+        model.write(&path).unwrap();
+        let error = crate::model::Model::load(&path).unwrap_err();
+        assert!(
+            matches!(error, crate::model::ModelError::Golden { .. }),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_sliding_window_estimates_what_a_recording_gives() {
+        for structure in ["best", "RLR", "TLTLT"] {
+            let predictor = model(structure).predictor();
+            let rows = 40;
+            let samples = signal(0, rows);
+            let columns: Vec<Vec<f64>> = (0..5)
+                .map(|c| samples.iter().skip(c).step_by(5).copied().collect())
+                .collect();
+            let views: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+            let series = predictor.predict_series(&views);
+            let mut workspace = predictor.workspace();
+            let mut window = SlidingWindow::new(&predictor);
+            let mut out = [0.0; 3];
+            for (row, sample) in samples.chunks(5).enumerate() {
+                window.push(&predictor, sample);
+                let inside = window.predict(&predictor, &mut out, &mut workspace);
+                match row.checked_sub(series.first_row) {
+                    None => assert_eq!(inside, None, "row {row}"),
+                    Some(k) => {
+                        assert_eq!(inside, Some(series.inside[k]));
+                        for (t, value) in out.iter().enumerate() {
+                            // f32 sums of size one, in another order where blocks of rows differ.
+                            assert!(
+                                (value - series.columns[t][k]).abs()
+                                    <= 1e-6 * predictor.targets.channels()[t].scale,
+                                "{structure} row {row}"
+                            );
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// The network as its configuration says, layer by layer in f64.
+    fn definition(model: &SyntheticModel, window: &[f64]) -> Vec<f64> {
+        use hydroflex_openapi::model::Activation;
+        let config = &model.config;
+        let scaled: Vec<f64> = window
+            .iter()
+            .enumerate()
+            .map(|(i, v)| {
+                let channel = &config.inputs[i % config.inputs.len()];
+                (v - channel.offset) / channel.scale
+            })
+            .collect();
+        let apply = |map: &LinearWeights, x: &[f64]| -> Vec<f64> {
+            map.weight
+                .chunks(x.len())
+                .zip(&map.bias)
+                .map(|(row, &b)| {
+                    row.iter().zip(x).map(|(&w, v)| f64::from(w) * v).sum::<f64>() + f64::from(b)
+                })
+                .collect()
+        };
+        let mut x = scaled.clone();
+        for (layer, map) in config.layers.iter().zip(&model.weights.layers) {
+            x = apply(map, &x);
+            for activation in &layer.activations {
+                for v in &mut x {
+                    *v = match activation {
+                        Activation::Tanh => v.tanh(),
+                        Activation::Sigmoid => 1.0 / (1.0 + (-*v).exp()),
+                        Activation::Relu => v.max(0.0),
+                        Activation::Elu => v.max(v.min(0.0).exp_m1()),
+                        Activation::Silu => *v / (1.0 + (-*v).exp()),
+                    };
+                }
+            }
+        }
+        if let Some(skip) = &model.weights.skip {
+            for (v, (row, b)) in x.iter_mut().zip(skip.weight.chunks(scaled.len()).zip(&skip.bias)) {
+                *v += b + row.iter().zip(&scaled).map(|(w, v)| w * v).sum::<f64>();
+            }
+        }
+        x.iter()
+            .zip(&config.targets)
+            .map(|(v, channel)| channel.offset + channel.scale * v)
+            .collect()
+    }
+
+    #[test]
+    fn every_structure_agrees_with_its_definition_in_f64() {
+        for structure in [
+            "L",
+            "RLR",
+            "TLT",
+            "TLTLT",
+            "TLSLTLSLT",
+            "ELE",
+            "LLL",
+            "RLLR",
+            "best",
+        ] {
+            let model = model(structure);
+            let predictor = model.predictor();
+            let samples = signal(0, 12 * 50);
+            let mut out = vec![0.0; 50 * 3];
+            predictor.predict_windows(&samples, &mut out, &mut predictor.workspace());
+            for (window, estimates) in samples.chunks(60).zip(out.chunks(3)) {
+                let truth = definition(&model, window);
+                for ((found, truth), channel) in estimates.iter().zip(truth).zip(&model.config.targets) {
+                    // The promise is 1e-6 of range; a range is several scales.
+                    assert!(
+                        (found - truth).abs() < 1e-6 * channel.scale,
+                        "{structure}, {}: {found} {truth}",
+                        channel.name
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_replaced_sample_counts_from_then_on() {
+        let predictor = model("RLR").predictor();
+        let mut workspace = predictor.workspace();
+        let (mut right, mut mended) = (SlidingWindow::new(&predictor), SlidingWindow::new(&predictor));
+        let samples = signal(0, 20);
+        for (row, sample) in samples.chunks(5).enumerate() {
+            right.push(&predictor, sample);
+            let held = if row == 15 { &samples[..5] } else { sample };
+            mended.push(&predictor, held);
+        }
+        let (mut a, mut b) = ([0.0; 3], [0.0; 3]);
+        right.predict(&predictor, &mut a, &mut workspace);
+        mended.predict(&predictor, &mut b, &mut workspace);
+        assert_ne!(a, b);
+        mended.replace(&predictor, 4, &samples[75..80]);
+        mended.predict(&predictor, &mut b, &mut workspace);
+        assert_eq!(a, b);
+    }
+
+    #[test]
+    fn a_value_outside_its_range_is_outside_until_it_has_left_the_window() {
+        let predictor = model("L").predictor();
+        let mut workspace = predictor.workspace();
+        let mut window = SlidingWindow::new(&predictor);
+        let samples = signal(0, 60);
+        let mut flags = Vec::new();
+        for (row, sample) in samples.chunks(5).enumerate() {
+            let mut sample = sample.to_vec();
+            if row == 20 {
+                sample[3] = 1e9;
+            }
+            window.push(&predictor, &sample);
+            flags.push(window.predict(&predictor, &mut [0.0; 3], &mut workspace));
+        }
+        assert_eq!(flags[19], Some(true));
+        assert!(flags[20..32].iter().all(|flag| *flag == Some(false)), "{flags:?}");
+        assert_eq!(flags[32], Some(true));
+        let mut batch = [true; 1];
+        let mut outlier = samples[..60].to_vec();
+        outlier[13] = 1e9;
+        predictor.predict_windows_with(&outlier, &mut [0.0; 3], Some(&mut batch), &mut workspace);
+        assert_eq!(batch, [false]);
+    }
+}

@@ -1,0 +1,159 @@
+//! A PostgreSQL server of our own. Where PostgreSQL is not installed, its tests pass with a note.
+
+use super::{free_port, when_we_are_gone};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, OnceLock};
+use std::time::{Duration, Instant};
+
+/// A server with its own data directory; the operating system's programs, our port.
+pub struct Postgres {
+    port: u16,
+    programs: PathBuf,
+    folder: PathBuf,
+    process: Mutex<Child>,
+}
+
+/// The server that the tests of one process share; `None` where PostgreSQL is not installed.
+pub fn shared() -> Option<&'static Postgres> {
+    static SERVER: OnceLock<Option<Postgres>> = OnceLock::new();
+    SERVER.get_or_init(Postgres::start).as_ref()
+}
+
+/// URL of a new, empty database of the shared server.
+pub fn fresh_database(name: &str) -> Option<String> {
+    Some(shared()?.database(name))
+}
+
+impl Postgres {
+    /// Starts a server; `None` where PostgreSQL is not installed.
+    pub fn start() -> Option<Self> {
+        let Some(programs) = programs() else {
+            eprintln!("PostgreSQL is not installed: its part of the suite is left out");
+            return None;
+        };
+        let folder = tempfile::tempdir().expect("a temporary directory").keep();
+        if is_root() {
+            let owned = Command::new("chown").arg("postgres").arg(&folder).status();
+            assert!(owned.expect("chown").success());
+        }
+        let made = as_postgres(&programs.join("initdb"))
+            .args([
+                "--username=postgres",
+                "--auth=trust",
+                "--encoding=UTF8",
+                "--no-sync",
+            ])
+            .arg("--pgdata")
+            .arg(folder.join("data"))
+            .stdout(Stdio::null())
+            .status();
+        assert!(made.expect("initdb").success(), "initdb");
+        let port = free_port();
+        let process = Mutex::new(launch(&programs, &folder, port));
+        when_we_are_gone(
+            &format!("kill -QUIT $(head -1 '{}/data/postmaster.pid')", folder.display()),
+            &folder,
+        );
+        let server = Self {
+            port,
+            programs,
+            folder,
+            process,
+        };
+        server.wait_until_ready();
+        Some(server)
+    }
+
+    /// URL of a new, empty database.
+    pub fn database(&self, name: &str) -> String {
+        // PostgreSQL cuts names at 63 bytes; ours differ before.
+        let name: String = name.chars().take(60).collect();
+        let made = as_postgres(&self.programs.join("createdb"))
+            .args(["--host", &self.folder.display().to_string()])
+            .args(["--port", &self.port.to_string(), "--username=postgres", &name])
+            .status();
+        assert!(made.expect("createdb").success(), "createdb {name}");
+        format!("postgres://postgres@127.0.0.1:{}/{name}", self.port)
+    }
+
+    /// Kills the server as a power cut would, and starts it again on the same port.
+    pub fn kill_and_restart(&self, pause: Duration) {
+        let mut process = self.process.lock().expect("nobody panics with the lock");
+        process.kill().expect("our own process");
+        process.wait().expect("our own process");
+        std::thread::sleep(pause);
+        let start = Instant::now();
+        loop {
+            *process = launch(&self.programs, &self.folder, self.port);
+            // Until the old server's last process has gone, a new one refuses to start.
+            std::thread::sleep(Duration::from_millis(200));
+            match process.try_wait() {
+                Ok(None) => break,
+                _ => assert!(
+                    start.elapsed() < Duration::from_secs(60),
+                    "PostgreSQL does not restart"
+                ),
+            }
+        }
+        drop(process);
+        self.wait_until_ready();
+    }
+
+    fn wait_until_ready(&self) {
+        let start = Instant::now();
+        loop {
+            let ready = Command::new(self.programs.join("pg_isready"))
+                .args(["--host=127.0.0.1", &format!("--port={}", self.port)])
+                .stdout(Stdio::null())
+                .status();
+            if ready.expect("pg_isready").success() {
+                return;
+            }
+            assert!(
+                start.elapsed() < Duration::from_secs(60),
+                "PostgreSQL does not start"
+            );
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+fn launch(programs: &Path, folder: &Path, port: u16) -> Child {
+    as_postgres(&programs.join("postgres"))
+        .arg("-D")
+        .arg(folder.join("data"))
+        .args(["-p", &port.to_string(), "-k", &folder.display().to_string()])
+        .args(["-c", "listen_addresses=127.0.0.1", "-c", "max_connections=300"])
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("PostgreSQL's own program")
+}
+
+/// PostgreSQL refuses to run as root: then it runs as the user that its package made.
+fn as_postgres(program: &Path) -> Command {
+    if is_root() {
+        let mut command = Command::new("setpriv");
+        command
+            .args(["--reuid=postgres", "--regid=postgres", "--init-groups", "--"])
+            .arg(program);
+        command
+    } else {
+        Command::new(program)
+    }
+}
+
+fn is_root() -> bool {
+    std::fs::metadata("/proc/self").is_ok_and(|own| own.uid() == 0)
+}
+
+fn programs() -> Option<PathBuf> {
+    let versions = std::fs::read_dir("/usr/lib/postgresql").ok()?;
+    versions
+        .flatten()
+        .map(|version| version.path().join("bin"))
+        .find(|bin| bin.join("initdb").is_file())
+}

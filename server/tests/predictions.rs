@@ -1,0 +1,550 @@
+//! Estimates over HTTP: JSON, tables, the Open Inference Protocol, aliases.
+
+mod common;
+
+use axum::body::Body;
+use common::Desk;
+use common::models::{register_folder, synthetic};
+use hydroflex_ml::predict::synthetic::signal;
+use hydroflex_openapi::catalogue::{AliasInfo, AliasList};
+use hydroflex_openapi::inference::{InferError, InferResponse, ModelMetadata, ServerMetadata};
+use hydroflex_openapi::prediction::PredictResponse;
+use serde_json::{Value, json};
+
+const INPUTS: [&str; 5] = [
+    "valve_lift_ratio",
+    "length_lift_m",
+    "velocity_lift_m_per_s",
+    "pressure_lift_piston_pa",
+    "pressure_lift_rod_pa",
+];
+
+/// The columns of `rows` samples as a JSON request.
+fn columns(rows: usize) -> Value {
+    let samples = signal(0, rows);
+    let inputs: serde_json::Map<String, Value> = INPUTS
+        .iter()
+        .enumerate()
+        .map(|(i, name)| {
+            let column: Vec<f64> = samples.iter().skip(i).step_by(5).copied().collect();
+            ((*name).to_owned(), json!(column))
+        })
+        .collect();
+    json!({ "inputs": inputs, "sample_time_s": 0.005 })
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_as_json_gives_estimates_with_intervals_flags_and_provenance() {
+    let desk = Desk::new().await;
+    let model = synthetic("best", 1);
+    let id = desk.register(&model).await;
+    let path = format!("/v1/models/{id}/predict");
+    let answer = desk.post(&path, &columns(20).to_string()).await;
+    assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
+    let answer: PredictResponse = answer.json();
+    assert_eq!((answer.first_step, answer.count), (11, 9));
+    assert_eq!(answer.provenance.model_sha256[..32], *id.as_str());
+    let predictor = model.predictor();
+    let mut workspace = predictor.workspace();
+    let mut expected = [0.0; 3];
+    let samples = signal(0, 20);
+    let (lower, upper) = (answer.lower.unwrap(), answer.upper.unwrap());
+    for window in 0..9 {
+        predictor.predict_window(
+            &samples[window * 5..(window + 12) * 5],
+            &mut expected,
+            &mut workspace,
+        );
+        for (target, channel) in model.config.targets.iter().enumerate() {
+            let found = answer.estimates[&channel.name][window];
+            assert!(
+                (found - expected[target]).abs() <= 1e-6 * channel.scale,
+                "{found} {}",
+                expected[target]
+            );
+            let half = predictor.half_width(target, found).unwrap();
+            assert!((lower[&channel.name][window] - (found - half)).abs() < 1e-12 * channel.scale.max(1.0));
+            assert!((upper[&channel.name][window] - (found + half)).abs() < 1e-12 * channel.scale.max(1.0));
+        }
+    }
+    assert_eq!(answer.inside_envelope.unwrap().len(), 9);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_wrong_with_a_recording_is_said_with_name_and_place() {
+    let desk = Desk::new().await;
+    let id = desk.register(&synthetic("RLR", 2)).await;
+    let path = format!("/v1/models/{id}/predict");
+    let refused = async |change: &dyn Fn(&mut Value)| {
+        let mut body = columns(20);
+        change(&mut body);
+        desk.post(&path, &body.to_string()).await.problem(422)
+    };
+    let missing = refused(&|body| {
+        body["inputs"].as_object_mut().unwrap().remove("valve_lift_ratio");
+    })
+    .await;
+    assert_eq!(missing.errors[0].pointer, "/inputs/valve_lift_ratio");
+    let unit = refused(&|body| {
+        let inputs = body["inputs"].as_object_mut().unwrap();
+        let pressure = inputs.remove("pressure_lift_piston_pa").unwrap();
+        inputs.insert("pressure_lift_piston_bar".to_owned(), pressure);
+    })
+    .await;
+    assert_eq!(unit.errors.len(), 1, "{unit:?}");
+    assert_eq!(unit.errors[0].pointer, "/inputs/pressure_lift_piston_bar");
+    assert!(
+        unit.errors[0].detail.contains("pressure_lift_piston_pa"),
+        "{unit:?}"
+    );
+    let unknown = refused(&|body| body["inputs"]["wind_m_per_s"] = json!(1.0)).await;
+    assert_eq!(unknown.errors[0].pointer, "/inputs/wind_m_per_s");
+    let short = refused(&|body| {
+        body["inputs"]["length_lift_m"].as_array_mut().unwrap().pop();
+    })
+    .await;
+    assert!(
+        short.errors.iter().any(|error| error.detail.contains("length")),
+        "{short:?}"
+    );
+    // No f64: JSON has no other way to say infinite.
+    let infinite = columns(20).to_string().replacen("0.0,", "1e999,", 1);
+    let infinite = desk.post(&path, &infinite).await.problem(400);
+    assert!(infinite.detail.contains("out of range"), "{infinite:?}");
+    let time = refused(&|body| body["sample_time_s"] = json!(0.01)).await;
+    assert_eq!(time.errors[0].pointer, "/sample_time_s");
+    let text = refused(&|body| body["inputs"]["length_lift_m"][3] = json!("one")).await;
+    assert!(
+        text.errors[0].pointer.starts_with("/inputs/length_lift_m"),
+        "{text:?}"
+    );
+    desk.post(&path, &"[".repeat(100_000)).await.problem(400);
+    desk.send("POST", &path, &[("content-type", "text/csv")], "a,b")
+        .await
+        .problem(415);
+    let picky = [("content-type", "application/json"), ("accept", "text/html")];
+    desk.send("POST", &path, &picky, columns(20).to_string())
+        .await
+        .problem(406);
+    let query = format!("{path}?sample_time_s=0.01");
+    assert_eq!(
+        desk.post(&query, &columns(20).to_string())
+            .await
+            .problem(422)
+            .errors[0]
+            .pointer,
+        "?sample_time_s"
+    );
+}
+
+/// A v2 request for `windows` windows that follow each other.
+fn infer_request(windows: usize) -> (Value, Vec<f64>) {
+    let samples = signal(0, 12 * windows);
+    let request = json!({
+        "id": "17",
+        "inputs": [{"name": "window", "datatype": "FP64", "shape": [windows, 12, 5], "data": samples}],
+    });
+    (request, samples)
+}
+
+fn expected(model: &hydroflex_ml::predict::synthetic::SyntheticModel, samples: &[f64]) -> Vec<f64> {
+    let predictor = model.predictor();
+    let mut out = vec![0.0; samples.len() / 60 * 3];
+    predictor.predict_windows(samples, &mut out, &mut predictor.workspace());
+    out
+}
+
+fn binary(request: &Value, bytes: &[u8]) -> (Vec<u8>, String) {
+    let mut body = request.to_string().into_bytes();
+    let length = body.len().to_string();
+    body.extend(bytes);
+    (body, length)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_inference_protocol_answers_in_json_and_in_bytes() {
+    let desk = Desk::new().await;
+    let model = synthetic("RLR", 3);
+    let id = desk.register(&model).await;
+    let server: ServerMetadata = desk.get("/v2").await.json();
+    assert_eq!(server.name, "hydroflex");
+    for path in [
+        "/v2/health/live".to_owned(),
+        "/v2/health/ready".to_owned(),
+        format!("/v2/models/{id}/ready"),
+    ] {
+        assert_eq!(desk.get(&path).await.status, 200, "{path}");
+    }
+    let metadata: ModelMetadata = desk.get(&format!("/v2/models/{id}")).await.json();
+    assert_eq!(metadata.inputs[0].shape, [-1, 12, 5]);
+    let names: Vec<&str> = metadata
+        .outputs
+        .iter()
+        .map(|output| output.name.as_str())
+        .collect();
+    assert_eq!(names, ["estimates", "lower", "upper", "inside_envelope"]);
+    assert_eq!(metadata.parameters.inputs, INPUTS);
+
+    let path = format!("/v2/models/{id}/infer");
+    let (request, samples) = infer_request(3);
+    let truth = expected(&model, &samples);
+    let answer: InferResponse = desk.post(&path, &request.to_string()).await.json();
+    assert_eq!(answer.id.as_deref(), Some("17"));
+    assert_eq!(answer.outputs[0].shape, [3, 3]);
+    assert_eq!(answer.outputs[0].data, Some(json!(truth)));
+    assert_eq!(answer.outputs[3].shape, [3]);
+
+    // Nested data, one output.
+    let mut nested = request.clone();
+    let rows: Vec<&[f64]> = samples.chunks(5).collect();
+    let windows: Vec<&[&[f64]]> = rows.chunks(12).collect();
+    nested["inputs"][0]["data"] = json!(windows);
+    nested["outputs"] = json!([{"name": "estimates"}]);
+    let answer: InferResponse = desk.post(&path, &nested.to_string()).await.json();
+    assert_eq!(answer.outputs.len(), 1);
+    assert_eq!(answer.outputs[0].data, Some(json!(truth)));
+
+    // Bytes both ways, in both precisions.
+    for (datatype, bytes) in [
+        (
+            "FP64",
+            samples.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>(),
+        ),
+        (
+            "FP32",
+            samples.iter().flat_map(|v| (*v as f32).to_le_bytes()).collect(),
+        ),
+    ] {
+        let request = json!({
+            "parameters": {"binary_data_output": true},
+            "inputs": [{"name": "window", "datatype": datatype, "shape": [3, 12, 5],
+                        "parameters": {"binary_data_size": bytes.len()}}],
+            "outputs": [{"name": "inside_envelope"}, {"name": "estimates"}],
+        });
+        let (body, length) = binary(&request, &bytes);
+        let headers = [("inference-header-content-length", length.as_str())];
+        let answer = desk.send("POST", &path, &headers, body).await;
+        assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
+        let json_length: usize = answer.header("inference-header-content-length").parse().unwrap();
+        let (head, tail) = answer.body.split_at(json_length);
+        let head: InferResponse = serde_json::from_slice(head).unwrap();
+        assert_eq!(head.outputs[1].parameters["binary_data_size"], 72);
+        assert_eq!(tail.len(), 3 + 72);
+        for (found, (truth, target)) in tail[3..]
+            .as_chunks()
+            .0
+            .iter()
+            .zip(truth.iter().zip(model.config.targets.iter().cycle()))
+        {
+            // Samples in single precision: 6e-8 of pressures of 2.5 scales, through a network.
+            let tolerance = if datatype == "FP64" {
+                0.0
+            } else {
+                1e-5 * target.scale
+            };
+            assert!(
+                (f64::from_le_bytes(*found) - truth).abs() <= tolerance,
+                "{datatype}"
+            );
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn protocol_errors_name_what_is_wrong() {
+    let desk = Desk::new().await;
+    let id = desk.register(&synthetic("RLR", 3)).await;
+    let path = format!("/v2/models/{id}/infer");
+    let refused = async |change: &dyn Fn(&mut Value), says: &str| {
+        let (mut request, _) = infer_request(2);
+        change(&mut request);
+        let text = request.to_string().replace("\"1e999\"", "1e999");
+        let answer = desk.post(&path, &text).await;
+        assert_eq!(answer.status, 400, "{says}");
+        let error: InferError = answer.json();
+        assert!(
+            error.error.contains(says),
+            "{} does not say {says:?}",
+            error.error
+        );
+    };
+    refused(&|r| r["inputs"][0]["name"] = json!("x"), "\"window\"").await;
+    refused(&|r| r["inputs"] = json!([]), "takes one").await;
+    refused(&|r| r["inputs"][0]["shape"] = json!([2, 11, 5]), "[batch, 12, 5]").await;
+    refused(&|r| r["inputs"][0]["shape"] = json!([0, 12, 5]), "at least 1").await;
+    refused(&|r| r["inputs"][0]["shape"] = json!([u64::MAX, 12, 5]), "values").await;
+    refused(&|r| r["inputs"][0]["datatype"] = json!("INT8"), "FP32").await;
+    refused(&|r| r["inputs"][0]["data"] = json!([1.0]), "1 values").await;
+    refused(&|r| r["inputs"][0]["data"] = json!([[[[1.0]]]]), "nested").await;
+    refused(&|r| r["inputs"][0]["data"] = json!("x"), "array of numbers").await;
+    refused(
+        &|r| {
+            r["inputs"][0].as_object_mut().unwrap().remove("data");
+        },
+        "no values",
+    )
+    .await;
+    refused(
+        &|r| r["inputs"][0]["parameters"] = json!({"binary_data_size": 8}),
+        "both",
+    )
+    .await;
+    refused(&|r| r["outputs"] = json!([{"name": "wind"}]), "estimates").await;
+    refused(
+        &|r| r["outputs"] = json!([{"name": "lower"}, {"name": "lower"}]),
+        "twice",
+    )
+    .await;
+    refused(
+        &|r| r["inputs"][0]["data"][68] = json!("1e999"),
+        "number out of range",
+    )
+    .await;
+    // A NaN can only come as bytes.
+    let mut samples = infer_request(2).1;
+    samples[68] = f64::NAN;
+    let bytes: Vec<u8> = samples.iter().flat_map(|v| v.to_le_bytes()).collect();
+    let request = json!({"inputs": [{"name": "window", "datatype": "FP64", "shape": [2, 12, 5],
+                                     "parameters": {"binary_data_size": bytes.len()}}]});
+    let (body, length) = binary(&request, &bytes);
+    let nan = desk
+        .send(
+            "POST",
+            &path,
+            &[("inference-header-content-length", &length)],
+            body.clone(),
+        )
+        .await;
+    let nan: InferError = nan.json();
+    assert!(
+        nan.error
+            .contains("NaN at [1, 1, 3], \"pressure_lift_piston_pa\""),
+        "{}",
+        nan.error
+    );
+    for (length, says) in [
+        ("x", "not a number"),
+        ("99999999", "has"),
+        ("-1", "not a number"),
+        ("3", "protocol"),
+    ] {
+        let answer = desk
+            .send(
+                "POST",
+                &path,
+                &[("inference-header-content-length", length)],
+                body.clone(),
+            )
+            .await;
+        assert_eq!(answer.status, 400);
+        assert!(answer.json::<InferError>().error.contains(says), "{length}");
+    }
+    for (path, says) in [
+        ("/v2/models/boom", "alias"),
+        ("/v2/models/boom@stable", "no alias"),
+        ("/v2/models/9f86d081884c7d659a2feaa0c55ad015", "no model"),
+        (&format!("/v2/models/{id}/versions/2"), "version"),
+        ("/v2/models/%ff/ready", "UTF-8"),
+    ] {
+        let answer = desk.get(path).await;
+        assert_eq!(answer.status, 404, "{path}");
+        let error: InferError = answer.json();
+        assert!(error.error.contains(says), "{path}: {}", error.error);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bodies_come_and_go_compressed() {
+    use std::io::{Read, Write};
+    let desk = Desk::new().await;
+    let model = synthetic("RLR", 3);
+    let id = desk.register(&model).await;
+    let path = format!("/v2/models/{id}/infer");
+    let (request, samples) = infer_request(64);
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(request.to_string().as_bytes()).unwrap();
+    let headers = [("content-encoding", "gzip"), ("accept-encoding", "gzip")];
+    let answer = desk
+        .send("POST", &path, &headers, encoder.finish().unwrap())
+        .await;
+    assert_eq!(
+        (answer.status.as_u16(), answer.header("content-encoding")),
+        (200, "gzip")
+    );
+    let mut text = String::new();
+    flate2::read::GzDecoder::new(answer.body.as_slice())
+        .read_to_string(&mut text)
+        .unwrap();
+    let answer: InferResponse = serde_json::from_str(&text).unwrap();
+    assert_eq!(answer.outputs[0].data, Some(json!(expected(&model, &samples))));
+    // A small body that becomes a large one is refused at the limit, not unpacked.
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    for _ in 0..80 {
+        encoder.write_all(&vec![b' '; 1 << 20]).unwrap();
+    }
+    let bomb = encoder.finish().unwrap();
+    assert!(bomb.len() < 1 << 20);
+    let answer = desk
+        .send("POST", &path, &[("content-encoding", "gzip")], bomb)
+        .await;
+    assert_eq!(answer.status, 413);
+    let garbage = desk
+        .send("POST", &path, &[("content-encoding", "gzip")], vec![7; 100])
+        .await;
+    assert_eq!(garbage.status, 400);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_alias_moves_between_models_and_earlier_ones_stay() {
+    let desk = Desk::new().await;
+    let (first, second) = (synthetic("RLR", 4), synthetic("RLR", 5));
+    let (a, b) = (desk.register(&first).await, desk.register(&second).await);
+    let path = "/v1/aliases/boom@stable";
+    desk.get(path).await.problem(404);
+    let json = ("content-type", "application/json");
+    let to = |id: &hydroflex_openapi::id::ModelId| json!({ "model_id": id }).to_string();
+    let made = desk
+        .send("PUT", path, &[json, ("if-none-match", "*")], to(&a))
+        .await;
+    assert_eq!((made.status.as_u16(), made.header("etag")), (201, "\"1\""));
+    desk.send("PUT", path, &[json, ("if-none-match", "*")], to(&b))
+        .await
+        .problem(412);
+    desk.send("PUT", path, &[json, ("if-match", "\"7\"")], to(&b))
+        .await
+        .problem(412);
+    let (request, samples) = infer_request(1);
+    let infer = async |path: &str| -> (String, Value) {
+        let answer = desk.post(path, &request.to_string()).await;
+        assert_eq!(
+            answer.status,
+            200,
+            "{path}: {}",
+            String::from_utf8_lossy(&answer.body)
+        );
+        let answer: InferResponse = answer.json();
+        (answer.model_version, answer.outputs[0].data.clone().unwrap())
+    };
+    let (of_first, of_second) = (
+        json!(expected(&first, &samples)),
+        json!(expected(&second, &samples)),
+    );
+    assert_ne!(of_first, of_second);
+    let by_alias = "/v2/models/boom@stable/infer";
+    assert_eq!(infer(by_alias).await, ("1".to_owned(), of_first.clone()));
+    let moved = desk
+        .send("PUT", path, &[json, ("if-match", "\"1\"")], to(&b))
+        .await;
+    assert_eq!((moved.status.as_u16(), moved.header("etag")), (200, "\"2\""));
+    let same = desk.send("PUT", path, &[json], to(&b)).await;
+    assert_eq!(
+        same.json::<AliasInfo>().generation,
+        2,
+        "a repeated move is no move"
+    );
+    assert_eq!(infer(by_alias).await, ("2".to_owned(), of_second.clone()));
+    assert_eq!(infer("/v2/models/boom%40stable/infer").await.1, of_second);
+    assert_eq!(infer("/v2/models/boom/versions/stable/infer").await.1, of_second);
+    assert_eq!(
+        infer("/v2/models/boom@stable/versions/1/infer").await,
+        ("1".to_owned(), of_first.clone())
+    );
+    assert_eq!(infer(&format!("/v2/models/{a}/infer")).await.1, of_first);
+    let metadata: ModelMetadata = desk.get("/v2/models/boom@stable").await.json();
+    assert_eq!(metadata.versions, ["1", "2"]);
+    let listed: AliasList = desk.get("/v1/aliases").await.json();
+    assert_eq!(listed.aliases.len(), 1);
+    assert_eq!(listed.aliases[0].model_id, b);
+    let predicted: PredictResponse = desk
+        .post("/v1/models/boom@stable/predict", &columns(12).to_string())
+        .await
+        .json();
+    assert_eq!(predicted.model_id, b);
+    desk.send("PUT", "/v1/aliases/Boom", &[json], to(&a))
+        .await
+        .problem(404);
+    let nobody = r#"{"model_id": "9f86d081884c7d659a2feaa0c55ad015"}"#;
+    desk.send("PUT", path, &[json], nobody).await.problem(422);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bad_model_never_replaces_a_good_one() {
+    let desk = Desk::new().await;
+    let good = desk.register(&synthetic("RLR", 6)).await;
+    let put = async |id: &hydroflex_openapi::id::ModelId| {
+        let body = json!({ "model_id": id }).to_string();
+        desk.send(
+            "PUT",
+            "/v1/aliases/boom@stable",
+            &[("content-type", "application/json")],
+            body,
+        )
+        .await
+    };
+    assert_eq!(put(&good).await.status, 201);
+    // Hashes agree, golden predictions do not.
+    let mut wrong = synthetic("RLR", 7);
+    wrong.config.golden[1].estimates[0] += 0.1 * wrong.config.targets[0].scale;
+    let wrong = desk.register(&wrong).await;
+    let problem = put(&wrong).await.problem(409);
+    assert!(problem.detail.contains("golden"), "{problem:?}");
+    // A file was changed after it was hashed.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model");
+    synthetic("RLR", 8).write(&path).unwrap();
+    let tensors = path.join("model.safetensors");
+    let mut content = std::fs::read(&tensors).unwrap();
+    *content.last_mut().unwrap() ^= 1;
+    std::fs::write(&tensors, content).unwrap();
+    let damaged = register_folder(&desk.ledger, &desk.blobs, &path).await;
+    assert!(put(&damaged).await.problem(409).detail.contains("hash"));
+    let shown: AliasInfo = desk.get("/v1/aliases/boom@stable").await.json();
+    assert_eq!((shown.model_id, shown.generation), (good, 1));
+    assert_eq!(desk.get("/v2/models/boom@stable/ready").await.status, 200);
+    assert_eq!(desk.get(&format!("/v2/models/{wrong}/ready")).await.status, 503);
+    desk.send(
+        "POST",
+        &format!("/v1/models/{damaged}/predict"),
+        &[("content-type", "application/json")],
+        Body::from(columns(12).to_string()),
+    )
+    .await
+    .problem(500);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn requests_by_alias_never_fail_while_it_moves() {
+    let desk = std::sync::Arc::new(Desk::new().await);
+    let ids = [
+        desk.register(&synthetic("L", 1)).await,
+        desk.register(&synthetic("L", 2)).await,
+    ];
+    let json = [("content-type", "application/json")];
+    let to = |id: &hydroflex_openapi::id::ModelId| json!({ "model_id": id }).to_string();
+    desk.send("PUT", "/v1/aliases/boom@stable", &json, to(&ids[0]))
+        .await;
+    let body = infer_request(1).0.to_string();
+    let asking: Vec<_> = (0..4)
+        .map(|_| {
+            let (desk, body) = (desk.clone(), body.clone());
+            tokio::spawn(async move {
+                let mut seen = std::collections::BTreeSet::new();
+                for _ in 0..200 {
+                    let answer = desk.post("/v2/models/boom@stable/infer", &body).await;
+                    assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
+                    seen.insert(answer.json::<InferResponse>().model_version);
+                }
+                seen
+            })
+        })
+        .collect();
+    for turn in 1..40 {
+        let moved = desk
+            .send("PUT", "/v1/aliases/boom@stable", &json, to(&ids[turn % 2]))
+            .await;
+        assert_eq!(moved.status, 200);
+    }
+    for task in asking {
+        assert!(!task.await.unwrap().is_empty());
+    }
+}
