@@ -10,7 +10,8 @@
 //!
 //! * [`runs`], [`window`], [`scaling`]: recorded signals, and how windows are cut from them.
 //! * [`structure`], [`network`]: what can be trained; the letters are the paper's.
-//! * [`least_squares`]: the best linear map of a window, baseline and skip connection in one.
+//! * [`least_squares`]: the best linear map of a window, a baseline; [`scheduled`]: the same with
+//!   coefficients that follow the machine's pose, the skip connection of our network.
 //! * [`train`]: the training loop on burn tensors, with checkpoints.
 //! * [`model`]: the model folder; [`predict`]: estimates without the tensor framework.
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
@@ -22,6 +23,7 @@ pub mod window;
 pub mod scaling;
 pub mod structure;
 pub mod least_squares;
+pub mod scheduled;
 pub mod network;
 pub mod train;
 pub mod model;

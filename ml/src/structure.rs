@@ -7,7 +7,8 @@ use hydroflex_openapi::model::{Activation, DenseLayer};
 pub struct Structure {
     /// As asked for.
     pub name: String,
-    /// Whether the least-squares map of the window is added, and the network learns the rest.
+    /// Whether the least-squares map of the window (coefficients following the pose) is added, and
+    /// the network learns the rest.
     pub linear_skip: bool,
     /// Widths of the hidden layers and what follows each of them.
     hidden: Vec<(usize, Vec<Activation>)>,

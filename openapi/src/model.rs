@@ -31,6 +31,13 @@ pub struct ModelConfig {
     pub targets: Vec<ScaledChannel>,
     /// Whether a linear map of the window (`skip.*`) is added to the network's output.
     pub linear_skip: bool,
+    /// Slow signals that the coefficients of the linear map follow; absent when they are constant.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub schedule: Option<Schedule>,
+    /// Smallest and largest value of each input, in its column's unit, at which it is held before it enters
+    /// the model: far outside its training data a polynomial says nothing, and says it loudly. Absent: not held.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub input_limits: Vec<[f64; 2]>,
     /// Layers of the network (`net.*`), first to last; empty when the skip is the whole model.
     pub layers: Vec<DenseLayer>,
     /// Where the model comes from.
@@ -61,6 +68,27 @@ pub struct ScaledChannel {
     pub offset: f64,
     /// Scale, in the column's unit, positive.
     pub scale: f64,
+}
+
+/// The skip's coefficients are polynomials of slow signals at the end of the window:
+///
+/// ```text
+/// skip = Σ_t m_t · (W_t window + b_t),   m_t = Π_c u_c ^ exponents[t][c],
+/// u_c = clamp((value_c − centre_c) / half_range_c, −1, 1)
+/// ```
+///
+/// Row `t · targets + target` of `skip.weight` and `skip.bias` belongs to term t and that target.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Schedule {
+    /// Positions of the slow signals among the inputs.
+    pub inputs: Vec<usize>,
+    /// Middle of the range in which the coefficients follow a signal, in its column's unit.
+    pub centre: Vec<f64>,
+    /// Half of that range, in its column's unit; beyond it the coefficients stay what they are at its edge.
+    pub half_range: Vec<f64>,
+    /// One row per term: the exponent of each signal.
+    pub exponents: Vec<Vec<u32>>,
 }
 
 /// `output = activation(weight · input + bias)`.
@@ -198,20 +226,33 @@ pub struct IntervalTable {
     pub half_widths: Vec<f64>,
 }
 
-/// Region of the training windows: a window is inside when its squared distance from the mean,
-/// weighted by the inverse covariance (tensor `envelope.projection` of `auxiliary.safetensors`), is at most `limit`, and
-/// every value is within the range of its channel.
+/// Region of the training windows: a window is inside when every value is within the range of its channel
+/// and, in each group, the mean square of its coordinates is at most the group's limit.
+///
+/// The coordinates are the window's principal components, divided by their standard deviation (tensors `envelope.*`
+/// of `auxiliary.safetensors`), largest variance first. Those of large variance tell unusual motions; those of
+/// small variance are relations that the physics keeps, which a stuck sensor or another payload breaks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Envelope {
-    /// Rows of `envelope.projection`.
+    /// Rows of `envelope.weight`.
     pub components: usize,
-    /// Largest squared norm of the projected window, per component.
-    pub limit: f64,
+    /// Consecutive components of similar variance; together they are all of them.
+    pub groups: Vec<EnvelopeGroup>,
     /// Smallest value of each input, in its column's unit.
     pub min: Vec<f64>,
     /// Largest value of each input, in its column's unit.
     pub max: Vec<f64>,
+}
+
+/// Components that are judged together.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EnvelopeGroup {
+    /// How many.
+    pub components: usize,
+    /// Largest mean square of the coordinates inside the envelope.
+    pub limit: f64,
 }
 
 /// A window and what the model says about it.

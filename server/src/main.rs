@@ -46,6 +46,8 @@ enum Command {
     Model(commands::model::Command),
     /// Estimate deflection, strain and stress from recorded sensor signals
     Predict(commands::predict::Args),
+    /// Repeat the published study: simulate, train the grid, evaluate, write the report
+    ReproducePaper(commands::paper::Args),
 }
 
 fn main() -> std::process::ExitCode {
@@ -65,6 +67,7 @@ fn main() -> std::process::ExitCode {
         Command::Evaluate(args) => commands::evaluate::run(args),
         Command::Model(command) => commands::model::run(command),
         Command::Predict(args) => commands::predict::run(args),
+        Command::ReproducePaper(args) => commands::paper::run(args),
     };
     match result {
         Ok(()) => std::process::ExitCode::SUCCESS,

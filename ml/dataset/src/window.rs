@@ -90,7 +90,8 @@ pub struct WindowCollector {
     valves: Vec<usize>,
     targets: Vec<Target>,
     runs: u64,
-    open_part_sum: f64,
+    open_steps: usize,
+    all_steps: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -151,7 +152,8 @@ impl WindowCollector {
                 })
                 .collect(),
             runs: 0,
-            open_part_sum: 0.0,
+            open_steps: 0,
+            all_steps: 0,
         }
     }
 
@@ -164,8 +166,8 @@ impl WindowCollector {
             .collect();
         let closing = closing_step(&valves);
         self.runs += 1;
-        let steps = samples.sample_count.saturating_sub(1).max(1);
-        self.open_part_sum += closing as f64 / steps as f64;
+        self.open_steps += closing;
+        self.all_steps += samples.sample_count.saturating_sub(1);
         for target in &mut self.targets {
             let d = &samples.columns[target.column];
             let band = band_steps(d, closing);
@@ -187,7 +189,8 @@ impl WindowCollector {
         if self.runs == 0 {
             return facts;
         }
-        facts.open_part = self.open_part_sum / self.runs as f64;
+        // One division of whole numbers: a fifth of the steps is 0.2 and nothing beside it.
+        facts.open_part = self.open_steps as f64 / self.all_steps.max(1) as f64;
         for target in &self.targets {
             let window = ChannelWindow {
                 band_s: target.band.seconds(h),

@@ -9,7 +9,7 @@ use hydroflex_openapi::model::IntervalTable;
 /// Part of the true values inside.
 pub const LEVEL: f64 = 0.9;
 /// Classes of amplitude, of equal numbers of validation windows.
-const CLASSES: usize = 6;
+const CLASSES: usize = 3;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
 

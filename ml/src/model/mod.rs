@@ -3,7 +3,7 @@
 //! | file | content |
 //! |---|---|
 //! | `config.json` | [`ModelConfig`]: window, channels, scales, layers, metrics, provenance, golden predictions |
-//! | `model.safetensors` | `net.N.weight`, `net.N.bias`, `skip.weight`, `skip.bias`, as PyTorch has them |
+//! | `model.safetensors` | `net.N.weight`, `net.N.bias`, `skip.weight`, `skip.bias` (f64), as PyTorch has them |
 //! | `auxiliary.safetensors` | linear baselines, envelope |
 //! | `model.onnx` | the same network with the scales in its graph |
 //! | `README.md` | model card |
@@ -242,6 +242,44 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
     }
     if config.layers.is_empty() && !config.linear_skip {
         return Err(inconsistent("a model needs layers or a linear map"));
+    }
+    if let Some(schedule) = &config.schedule {
+        let signals = schedule.inputs.len();
+        if !config.linear_skip || schedule.exponents.is_empty() {
+            return Err(inconsistent(
+                "a schedule needs a linear map and at least one term",
+            ));
+        }
+        if schedule.centre.len() != signals
+            || schedule.half_range.len() != signals
+            || schedule.exponents.iter().any(|e| e.len() != signals)
+            || schedule.inputs.iter().any(|&i| i >= config.inputs.len())
+            || schedule.half_range.iter().any(|h| !(h.is_finite() && *h > 0.0))
+        {
+            return Err(inconsistent(
+                "the schedule's signals, ranges and exponents do not fit together",
+            ));
+        }
+    }
+    if config.envelope.as_ref().is_some_and(|envelope| {
+        envelope.groups.iter().map(|g| g.components).sum::<usize>() != envelope.components
+            || envelope.min.len() != config.inputs.len()
+            || envelope.max.len() != config.inputs.len()
+    }) {
+        return Err(inconsistent(
+            "the envelope's groups or ranges do not fit its components or the inputs",
+        ));
+    }
+    let held = &config.input_limits;
+    if !held.is_empty()
+        && (held.len() != config.inputs.len()
+            || held
+                .iter()
+                .any(|[low, high]| !(low.is_finite() && low <= high && high.is_finite())))
+    {
+        return Err(inconsistent(
+            "input limits must be finite and ordered, one pair per input",
+        ));
     }
     let scales = config.inputs.iter().chain(&config.targets);
     if scales

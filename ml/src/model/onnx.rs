@@ -1,14 +1,15 @@
 //! `model.onnx`: the network with its scales, for onnxruntime and whatever else reads ONNX.
 //!
 //! ```text
-//! window [batch, steps, inputs] f64 → scale → f32 → flatten → layers (+ skip) → f64 → unscale → estimates [batch, targets]
+//! window [batch, steps, inputs] f64 → scale → flatten ─► f32 → layers → f64 ─► + ─► unscale → estimates [batch, targets]
+//!                                                    └► f64 skip, times powers of the slow signals ─┘
 //! ```
 //!
 //! Only the messages and fields that this graph needs are declared, with the numbers of
 //! `onnx.proto` (IR version 8, operator set 17).
 
-use super::weights::{LinearWeights, Weights};
-use hydroflex_openapi::model::{Activation, ModelConfig, ScaledChannel};
+use super::weights::{LinearWeights, SkipWeights, Weights};
+use hydroflex_openapi::model::{Activation, ModelConfig, ScaledChannel, Schedule};
 use prost::Message;
 
 const IR_VERSION: i64 = 8;
@@ -145,16 +146,19 @@ mod dimension {
 pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
     let mut graph = Graph::default();
     let window_values = config.window_steps * config.inputs.len();
-    let mut x = graph.scale_inputs(&config.inputs, window_values);
-    let flat = x.clone();
+    let flat = graph.scale_inputs(config, window_values);
+    let mut x = graph.cast(&flat, FLOAT);
+    // The skip computes in f64 with what the network sees, as in training.
+    let rounded = graph.cast(&x, DOUBLE);
     for (layer, map) in config.layers.iter().zip(&weights.layers) {
         x = graph.gemm(&layer.name, &x, map);
         for &activation in &layer.activations {
             x = graph.activation(&x, activation);
         }
     }
+    x = graph.cast(&x, DOUBLE);
     if let Some(skip) = &weights.skip {
-        let linear = graph.gemm("skip", &flat, skip);
+        let linear = graph.skip(config, skip, &rounded, window_values);
         x = if config.layers.is_empty() {
             linear
         } else {
@@ -246,7 +250,8 @@ impl Graph {
         self.constant(name, DOUBLE, &[raw.len() / 8], raw)
     }
 
-    fn scale_inputs(&mut self, channels: &[ScaledChannel], window_values: usize) -> String {
+    fn scale_inputs(&mut self, config: &ModelConfig, window_values: usize) -> String {
+        let channels = &config.inputs;
         let offset = self.doubles("input_offset", channels.iter().map(|c| c.offset));
         let scale = self.doubles("input_scale", channels.iter().map(|c| c.scale));
         let flat = [-1, to_i64(window_values)]
@@ -254,17 +259,95 @@ impl Graph {
             .flat_map(|d: &i64| d.to_le_bytes())
             .collect();
         let shape = self.constant("window_shape", INT64, &[2], flat);
-        let centred = self.node("Sub", &["window", &offset], Vec::new());
+        let mut window = "window".to_owned();
+        if !config.input_limits.is_empty() {
+            let low = self.doubles("input_low", config.input_limits.iter().map(|l| l[0]));
+            let high = self.doubles("input_high", config.input_limits.iter().map(|l| l[1]));
+            let above = self.node("Max", &[&window, &low], Vec::new());
+            window = self.node("Min", &[&above, &high], Vec::new());
+        }
+        let centred = self.node("Sub", &[&window, &offset], Vec::new());
         let scaled = self.node("Div", &[&centred, &scale], Vec::new());
-        let single = self.node("Cast", &[&scaled], vec![integer("to", i64::from(FLOAT))]);
-        self.node("Reshape", &[&single, &shape], Vec::new())
+        self.node("Reshape", &[&scaled, &shape], Vec::new())
+    }
+
+    fn cast(&mut self, x: &str, data_type: i32) -> String {
+        self.node("Cast", &[x], vec![integer("to", i64::from(data_type))])
+    }
+
+    /// Columns `first .. first + count` of a matrix.
+    fn columns(&mut self, name: &str, x: &str, first: usize, count: usize) -> String {
+        let raw = (first..first + count)
+            .flat_map(|i| to_i64(i).to_le_bytes())
+            .collect();
+        let indices = self.constant(name, INT64, &[count], raw);
+        self.node("Gather", &[x, &indices], vec![integer("axis", 1)])
+    }
+
+    /// `Σ_t m_t (W_t x + b_t)` in f64.
+    fn skip(&mut self, config: &ModelConfig, map: &SkipWeights, flat: &str, window_values: usize) -> String {
+        let outputs = map.bias.len();
+        let raw = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let dims = [outputs, map.weight.len() / outputs.max(1)];
+        let weight = self.constant("skip.weight", DOUBLE, &dims, raw(&map.weight));
+        let bias = self.constant("skip.bias", DOUBLE, &[outputs], raw(&map.bias));
+        let all = self.node("Gemm", &[flat, &weight, &bias], vec![integer("transB", 1)]);
+        let Some(schedule) = &config.schedule else {
+            return all;
+        };
+        let slow = self.slow_signals(config, schedule, flat, window_values);
+        let targets = config.targets.len();
+        let mut sum: Option<String> = None;
+        for (term, exponents) in schedule.exponents.iter().enumerate() {
+            let mut part = self.columns(&format!("term_{term}"), &all, term * targets, targets);
+            for (signal, &exponent) in slow.iter().zip(exponents) {
+                for _ in 0..exponent {
+                    part = self.node("Mul", &[&part, signal], Vec::new());
+                }
+            }
+            sum = Some(match sum {
+                Some(sum) => self.node("Add", &[&sum, &part], Vec::new()),
+                None => part,
+            });
+        }
+        sum.unwrap_or(all)
+    }
+
+    /// u of each slow signal: `[batch, 1]`, f64.
+    fn slow_signals(
+        &mut self,
+        config: &ModelConfig,
+        schedule: &Schedule,
+        flat: &str,
+        window_values: usize,
+    ) -> Vec<String> {
+        let minus_one = self.doubles("minus_one", std::iter::once(-1.0));
+        let one = self.doubles("one", std::iter::once(1.0));
+        schedule
+            .inputs
+            .iter()
+            .zip(schedule.centre.iter().zip(&schedule.half_range))
+            .map(|(&input, (centre, half_range))| {
+                let channel = &config.inputs[input];
+                let last = window_values - config.inputs.len() + input;
+                let scaled = self.columns(&format!("slow_{input}"), flat, last, 1);
+                // (scale · scaled + offset − centre) / half_range
+                let gain = channel.scale / half_range;
+                let shift = (channel.offset - centre) / half_range;
+                let gain = self.doubles(&format!("slow_{input}_gain"), std::iter::once(gain));
+                let shift = self.doubles(&format!("slow_{input}_shift"), std::iter::once(shift));
+                let grown = self.node("Mul", &[&scaled, &gain], Vec::new());
+                let moved = self.node("Add", &[&grown, &shift], Vec::new());
+                let above = self.node("Max", &[&moved, &minus_one], Vec::new());
+                self.node("Min", &[&above, &one], Vec::new())
+            })
+            .collect()
     }
 
     fn unscale_outputs(&mut self, channels: &[ScaledChannel], x: &str) {
         let offset = self.doubles("target_offset", channels.iter().map(|c| c.offset));
         let scale = self.doubles("target_scale", channels.iter().map(|c| c.scale));
-        let double = self.node("Cast", &[x], vec![integer("to", i64::from(DOUBLE))]);
-        let scaled = self.node("Mul", &[&double, &scale], Vec::new());
+        let scaled = self.node("Mul", &[x, &scale], Vec::new());
         self.named_node("Add", &[&scaled, &offset], Vec::new(), "estimates".to_owned());
     }
 

@@ -2,6 +2,7 @@
 
 use super::ModelError;
 use crate::least_squares::LinearMap;
+use crate::scheduled::ScheduledMap;
 use crate::train::checkpoint::{from_bytes, to_bytes};
 use hydroflex_openapi::model::{DenseLayer, ModelConfig};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
@@ -26,13 +27,32 @@ impl From<&LinearMap> for LinearWeights {
     }
 }
 
+/// A linear map in f64.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SkipWeights {
+    /// (terms · targets) × window values, row-major.
+    pub weight: Vec<f64>,
+    /// One per row.
+    pub bias: Vec<f64>,
+}
+
+impl From<&ScheduledMap> for SkipWeights {
+    fn from(map: &ScheduledMap) -> Self {
+        Self {
+            weight: map.weight.clone(),
+            bias: map.bias.clone(),
+        }
+    }
+}
+
 /// `model.safetensors`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Weights {
     /// Of each layer.
     pub layers: Vec<LinearWeights>,
-    /// Of the skip, where there is one.
-    pub skip: Option<LinearWeights>,
+    /// Of the skip, where there is one. f64: its large coefficients act on small differences of
+    /// neighbouring samples.
+    pub skip: Option<SkipWeights>,
 }
 
 /// `auxiliary.safetensors`: estimators to compare with, and the envelope's projection.
@@ -46,37 +66,59 @@ pub struct Auxiliary {
     pub envelope: Option<LinearWeights>,
 }
 
-struct Tensor<'a> {
+struct Tensor {
     name: String,
+    dtype: Dtype,
     shape: Vec<usize>,
-    values: &'a [f32],
+    bytes: Vec<u8>,
 }
 
-fn linear<'a>(prefix: &str, map: &'a LinearWeights) -> [Tensor<'a>; 2] {
-    let outputs = map.bias.len();
+/// Weight and bias from little-endian bytes.
+fn pair(prefix: &str, dtype: Dtype, outputs: usize, inputs: usize, bytes: [Vec<u8>; 2]) -> [Tensor; 2] {
+    let [weight, bias] = bytes;
+    let tensor = |part: &str, shape: Vec<usize>, bytes| Tensor {
+        name: format!("{prefix}.{part}"),
+        dtype,
+        shape,
+        bytes,
+    };
     [
-        Tensor {
-            name: format!("{prefix}.weight"),
-            shape: vec![outputs, map.weight.len() / outputs.max(1)],
-            values: &map.weight,
-        },
-        Tensor {
-            name: format!("{prefix}.bias"),
-            shape: vec![outputs],
-            values: &map.bias,
-        },
+        tensor("weight", vec![outputs, inputs], weight),
+        tensor("bias", vec![outputs], bias),
     ]
 }
 
-fn to_file(tensors: &[Tensor<'_>]) -> Result<Vec<u8>, safetensors::SafeTensorError> {
-    let bytes: Vec<Vec<u8>> = tensors.iter().map(|t| to_bytes(t.values)).collect();
+fn linear(prefix: &str, map: &LinearWeights) -> [Tensor; 2] {
+    let outputs = map.bias.len();
+    let bytes = [to_bytes(&map.weight), to_bytes(&map.bias)];
+    pair(
+        prefix,
+        Dtype::F32,
+        outputs,
+        map.weight.len() / outputs.max(1),
+        bytes,
+    )
+}
+
+fn skip_tensors(map: &SkipWeights) -> [Tensor; 2] {
+    let outputs = map.bias.len();
+    let bytes = [&map.weight, &map.bias].map(|values| values.iter().flat_map(|v| v.to_le_bytes()).collect());
+    pair(
+        "skip",
+        Dtype::F64,
+        outputs,
+        map.weight.len() / outputs.max(1),
+        bytes,
+    )
+}
+
+fn to_file(tensors: &[Tensor]) -> Result<Vec<u8>, safetensors::SafeTensorError> {
     let views = tensors
         .iter()
-        .zip(&bytes)
-        .map(|(t, data)| {
+        .map(|t| {
             Ok((
                 t.name.as_str(),
-                TensorView::new(Dtype::F32, t.shape.clone(), data)?,
+                TensorView::new(t.dtype, t.shape.clone(), &t.bytes)?,
             ))
         })
         .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()?;
@@ -98,9 +140,23 @@ impl<'a> Reader<'a> {
     }
 
     fn take(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>, ModelError> {
-        let tensor = self.tensors.tensor(name).ok().filter(|t| t.dtype() == Dtype::F32);
+        self.bytes(name, Dtype::F32, expected).map(from_bytes)
+    }
+
+    fn take_f64(&self, name: &str, expected: &[usize]) -> Result<Vec<f64>, ModelError> {
+        let bytes = self.bytes(name, Dtype::F64, expected)?;
+        Ok(bytes
+            .as_chunks::<8>()
+            .0
+            .iter()
+            .map(|b| f64::from_le_bytes(*b))
+            .collect())
+    }
+
+    fn bytes(&self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<&'a [u8], ModelError> {
+        let tensor = self.tensors.tensor(name).ok().filter(|t| t.dtype() == dtype);
         match tensor {
-            Some(tensor) if tensor.shape() == expected => Ok(from_bytes(tensor.data())),
+            Some(tensor) if tensor.shape() == expected => Ok(tensor.data()),
             other => Err(ModelError::TensorShape {
                 path: self.path.to_owned(),
                 name: name.to_owned(),
@@ -124,13 +180,13 @@ impl Weights {
     /// # Errors
     /// A shape does not fit its values.
     pub fn to_file(&self, layers: &[DenseLayer]) -> Result<Vec<u8>, safetensors::SafeTensorError> {
-        let mut tensors: Vec<Tensor<'_>> = layers
+        let mut tensors: Vec<Tensor> = layers
             .iter()
             .zip(&self.layers)
             .flat_map(|(layer, map)| linear(&layer.name, map))
             .collect();
         if let Some(skip) = &self.skip {
-            tensors.extend(linear("skip", skip));
+            tensors.extend(skip_tensors(skip));
         }
         to_file(&tensors)
     }
@@ -148,10 +204,15 @@ impl Weights {
             .map(|layer| reader.linear(&layer.name, layer.outputs, layer.inputs))
             .collect::<Result<_, _>>()?;
         let window_values = config.window_steps * config.inputs.len();
-        let skip = config
-            .linear_skip
-            .then(|| reader.linear("skip", config.targets.len(), window_values))
-            .transpose()?;
+        let rows = config.schedule.as_ref().map_or(1, |s| s.exponents.len()) * config.targets.len();
+        let skip = if config.linear_skip {
+            Some(SkipWeights {
+                weight: reader.take_f64("skip.weight", &[rows, window_values])?,
+                bias: reader.take_f64("skip.bias", &[rows])?,
+            })
+        } else {
+            None
+        };
         Ok(Self { layers, skip })
     }
 }
@@ -162,7 +223,7 @@ impl Auxiliary {
     /// # Errors
     /// A shape does not fit its values.
     pub fn to_file(&self) -> Result<Vec<u8>, safetensors::SafeTensorError> {
-        let mut tensors: Vec<Tensor<'_>> = Vec::new();
+        let mut tensors: Vec<Tensor> = Vec::new();
         tensors.extend(linear("least_squares", &self.least_squares));
         tensors.extend(linear("quasi_static", &self.quasi_static));
         if let Some(envelope) = &self.envelope {

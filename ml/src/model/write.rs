@@ -1,18 +1,19 @@
 //! Writing a model folder.
 
-use super::weights::{Auxiliary, LinearWeights, Weights};
+use super::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
 use crate::predict::Predictor;
+use crate::scheduled::RANGE_FACTOR;
 use crate::structure::parameter_count;
 use crate::train::Outcome;
 use crate::train::prepare::{Part, Problem, TrainingData};
 use crate::window::{Series, Windows};
 use hydroflex_openapi::job::WindowCut;
 use hydroflex_openapi::model::{
-    DenseLayer, Envelope, GoldenPrediction, MODEL_FORMAT_VERSION, ModelConfig, ModelProvenance, ModelSummary,
-    TargetMetrics,
+    DenseLayer, Envelope, EnvelopeGroup, GoldenPrediction, MODEL_FORMAT_VERSION, ModelConfig,
+    ModelProvenance, ModelSummary, TargetMetrics,
 };
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
@@ -23,12 +24,17 @@ use std::path::Path;
 const GOLDEN_WINDOWS: usize = 3;
 /// Version of the tensor framework, as in the workspace's manifest.
 const BURN_VERSION: &str = "0.22.1";
-/// Directions of the envelope have at least this part of the largest variance.
-const ENVELOPE_CUT: f64 = 1e-6;
-/// Part of the validation windows inside the envelope.
+/// Directions of the envelope have at least this part of the largest variance: below, rounding of the
+/// scaled inputs to f32 would be seen.
+const ENVELOPE_CUT: f64 = 1e-12;
+/// Variances within a group differ by at most this many powers of ten.
+const ENVELOPE_DECADES: f64 = 2.0;
+/// Part of the validation windows within each group's limit, before the limit is widened …
 const ENVELOPE_QUANTILE: f64 = 0.998;
-/// Room around the training range of each input, relative to it.
-const ENVELOPE_MARGIN: f64 = 0.05;
+/// … by this factor, for what a few runs did not show.
+const ENVELOPE_ROOM: f64 = 1.5;
+/// Room around the training range of each input, relative to it: as far as our network follows.
+const ENVELOPE_MARGIN: f64 = 0.5 * (RANGE_FACTOR - 1.0);
 
 /// Assembles the model and writes its folder, replacing what is there.
 ///
@@ -55,7 +61,7 @@ pub fn write_model(
     config.validation_least_squares = judged.least_squares;
     config.intervals = judged.intervals;
     if let Some(envelope) = &mut config.envelope {
-        envelope.limit = envelope_limit(problem, &auxiliary);
+        set_limits(&mut envelope.groups, problem, &auxiliary);
     }
     config.golden = golden(problem, data, &predictor);
     write_parts(&config, &weights, &auxiliary, out_dir)?;
@@ -193,10 +199,7 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
     }
     Weights {
         layers,
-        skip: problem
-            .structure
-            .linear_skip
-            .then(|| LinearWeights::from(&problem.linear)),
+        skip: problem.skip.as_ref().map(SkipWeights::from),
     }
 }
 
@@ -278,7 +281,7 @@ fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights)
     (
         Envelope {
             components: rows.len(),
-            limit: 0.0,
+            groups: groups(&problem.spectrum.values, rows.len()),
             min,
             max,
         },
@@ -286,23 +289,47 @@ fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights)
     )
 }
 
-/// Squared length per component that [`ENVELOPE_QUANTILE`] of the validation windows stay below.
-fn envelope_limit(problem: &Problem, auxiliary: &Auxiliary) -> f64 {
-    let Some(map) = &auxiliary.envelope else {
-        return f64::MAX;
-    };
+/// The first `count` directions, largest variance first, in groups of similar variance; no limits yet.
+fn groups(ascending: &[f64], count: usize) -> Vec<EnvelopeGroup> {
+    let largest = ascending.last().copied().unwrap_or(1.0);
+    let mut groups: Vec<EnvelopeGroup> = Vec::new();
+    let mut edge = f64::INFINITY;
+    for value in ascending.iter().rev().take(count) {
+        let decade = (value / largest).log10();
+        match groups.last_mut() {
+            Some(group) if decade > edge => group.components += 1,
+            _ => {
+                edge = decade - ENVELOPE_DECADES;
+                groups.push(EnvelopeGroup {
+                    components: 1,
+                    limit: f64::MAX,
+                });
+            }
+        }
+    }
+    groups
+}
+
+/// Limits that all but rare validation windows keep.
+fn set_limits(groups: &mut [EnvelopeGroup], problem: &Problem, auxiliary: &Auxiliary) {
+    let Some(map) = &auxiliary.envelope else { return };
     let projection = crate::predict::kernel::PackedLayer::new(map, &[]);
-    let components = map.bias.len();
     let part = &problem.validation;
     let mut out = vec![0.0; projection.padded()];
-    let mut squares: Vec<f64> = (0..part.windows.len())
-        .map(|index| {
-            let window = part.series.window(part.windows.first_row(index), problem.steps);
-            projection.forward(window, window.len(), 1, &mut out);
-            out[..components].iter().map(|&v| f64::from(v * v)).sum::<f64>() / components as f64
-        })
-        .collect();
-    evaluate::metrics::quantile(&mut squares, ENVELOPE_QUANTILE)
+    let mut squares = vec![Vec::with_capacity(part.windows.len()); groups.len()];
+    for index in 0..part.windows.len() {
+        let window = part.series.window(part.windows.first_row(index), problem.steps);
+        projection.forward(window, window.len(), 1, &mut out);
+        for (all, square) in squares
+            .iter_mut()
+            .zip(crate::predict::group_squares(groups, &out))
+        {
+            all.push(square);
+        }
+    }
+    for (group, squares) in groups.iter_mut().zip(&mut squares) {
+        group.limit = ENVELOPE_ROOM * evaluate::metrics::quantile(squares, ENVELOPE_QUANTILE);
+    }
 }
 
 struct Judged {
@@ -407,6 +434,8 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         inputs: problem.input_scaling.channels().to_vec(),
         targets: problem.target_scaling.channels().to_vec(),
         linear_skip: problem.structure.linear_skip,
+        input_limits: problem.input_limits.clone(),
+        schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),
         layers: final_layers(problem),
         provenance: ModelProvenance {
             spec: problem.spec.clone(),
@@ -418,7 +447,12 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
             best_epoch: outcome.best_epoch,
             learning_rate: problem.recipe.learning_rate,
             batch: problem.recipe.batch,
-            ridge: Some(problem.linear.ridge),
+            ridge: Some(
+                problem
+                    .skip
+                    .as_ref()
+                    .map_or(problem.linear.ridge, |skip| skip.ridge),
+            ),
             history: outcome.history.clone(),
             ended_by: outcome.ended_by,
             hydroflex_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -435,7 +469,8 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
 fn summary(model: &Model, problem: &Problem, outcome: &Outcome) -> ModelSummary {
     let config = model.config();
     let skip = if config.linear_skip {
-        config.targets.len() * (config.window_steps * config.inputs.len() + 1)
+        let terms = config.schedule.as_ref().map_or(1, |s| s.exponents.len());
+        terms * config.targets.len() * (config.window_steps * config.inputs.len() + 1)
     } else {
         0
     };

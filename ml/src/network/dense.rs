@@ -199,7 +199,7 @@ impl<B: DenseKernels, C: CheckpointStrategy> DenseOps for Autodiff<B, C> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::network::{NetworkTensors, batch_tensor, init::initial_parameters};
+    use crate::network::{Loss, NetworkTensors, batch_tensor, init::initial_parameters};
     use crate::structure::Structure;
     use burn::tensor::Device;
     use hydroflex_openapi::model::DenseLayer;
@@ -216,7 +216,13 @@ mod tests {
     }
 
     /// Loss in f64, by the definition.
-    fn loss_f64(layers: &[DenseLayer], parameters: &[f64], windows: &[f32], targets: &[f32]) -> f64 {
+    fn loss_f64(
+        layers: &[DenseLayer],
+        parameters: &[f64],
+        windows: &[f32],
+        targets: &[f32],
+        loss: Loss,
+    ) -> f64 {
         let mut total = 0.0;
         for (window, target) in windows.chunks(6).zip(targets.chunks(2)) {
             let mut x: Vec<f64> = window.iter().map(|&v| f64::from(v)).collect();
@@ -237,7 +243,7 @@ mod tests {
             total += x
                 .iter()
                 .zip(target)
-                .map(|(a, &b)| (a - f64::from(b)).powi(2))
+                .map(|(a, &b)| loss.value(a - f64::from(b)))
                 .sum::<f64>();
         }
         total / targets.len() as f64
@@ -253,12 +259,18 @@ mod tests {
             let targets: Vec<f32> = (30..40).map(wide).collect();
             let parameters = initial_parameters(&layers, 1, 1.0);
             let exact: Vec<f64> = parameters.iter().map(|&p| f64::from(p)).collect();
-            let loss_of = |p: &[f64]| loss_f64(&layers, p, &windows, &targets);
+            let kind = if name == "best" {
+                Loss::PseudoHuber
+            } else {
+                Loss::Square
+            };
+            let loss_of = |p: &[f64]| loss_f64(&layers, p, &windows, &targets, kind);
             let device = Device::flex().autodiff();
             let mut gradient = vec![0.0; parameters.len()];
             let loss = NetworkTensors::new(&layers, &parameters, &device).loss_and_gradient(
                 batch_tensor(windows.clone(), 5, &device),
                 batch_tensor(targets.clone(), 5, &device),
+                kind,
                 10.0,
                 &mut gradient,
             );

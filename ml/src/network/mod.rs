@@ -16,6 +16,35 @@ pub struct NetworkTensors {
     layers: Vec<LayerTensors>,
 }
 
+/// What is minimised, as a function of each error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Loss {
+    /// e².
+    Square,
+    /// 2 (√(1 + e²) − 1): e² for small errors, 2 |e| for large ones, so that rare large errors do
+    /// not decide.
+    PseudoHuber,
+}
+
+impl Loss {
+    fn of(self, error: Tensor<2>) -> Tensor<2> {
+        let square = error.clone() * error;
+        match self {
+            Self::Square => square,
+            Self::PseudoHuber => ((square + 1.0).sqrt() - 1.0) * 2.0,
+        }
+    }
+
+    /// Of one error.
+    #[must_use]
+    pub fn value(self, error: f64) -> f64 {
+        match self {
+            Self::Square => error * error,
+            Self::PseudoHuber => 2.0 * ((1.0 + error * error).sqrt() - 1.0),
+        }
+    }
+}
+
 struct LayerTensors {
     weight: Tensor<2>,
     bias: Tensor<1>,
@@ -72,7 +101,7 @@ impl NetworkTensors {
         })
     }
 
-    /// Mean squared error of a batch, and its gradient added to `gradient` (flat, as the parameters).
+    /// Loss of a batch, and its gradient added to `gradient` (flat, as the parameters).
     ///
     /// `divisor` is the number of values that the mean is over; it may exceed this batch when the
     /// batch is one part of a larger one.
@@ -83,11 +112,12 @@ impl NetworkTensors {
         &self,
         windows: Tensor<2>,
         targets: Tensor<2>,
+        loss: Loss,
         divisor: f32,
         gradient: &mut [f32],
     ) -> f32 {
         let error = self.forward(windows) - targets;
-        let loss = (error.clone() * error).sum() / divisor;
+        let loss = loss.of(error).sum() / divisor;
         let value = first_value(&loss.clone().inner().into_data());
         let mut grads = loss.backward();
         let mut rest = gradient;

@@ -5,13 +5,15 @@
 //! overlap in memory, so sliding over a recording copies nothing either.
 
 pub mod kernel;
+pub mod skip;
 pub mod sliding;
 pub mod synthetic;
 
 use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
-use hydroflex_openapi::model::{Activation, IntervalTable, ModelConfig};
+use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelConfig};
 use kernel::PackedLayer;
+use skip::SkipKernel;
 
 /// Rows computed at once; activations of a block stay in the second-level cache.
 const BLOCK_ROWS: usize = 48;
@@ -24,11 +26,11 @@ pub struct Predictor {
     /// Offset and 1 / scale of every value of one sample row.
     input_maps: Vec<(f64, f64)>,
     targets: Scaling,
-    /// First to last; the first one also holds the skip as a linear tail.
+    /// Scaled values at which inputs are held; infinite where they are not.
+    limits: Vec<[f64; 2]>,
+    /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
-    /// Outputs of the first layer that belong to the network; what follows is the skip.
-    first_width: usize,
-    has_skip: bool,
+    skip: Option<SkipKernel>,
     intervals: Vec<IntervalTable>,
     envelope: Option<EnvelopeKernel>,
 }
@@ -36,8 +38,7 @@ pub struct Predictor {
 #[derive(Debug, Clone, PartialEq)]
 struct EnvelopeKernel {
     projection: PackedLayer,
-    components: usize,
-    limit: f64,
+    groups: Vec<EnvelopeGroup>,
     min: Vec<f64>,
     max: Vec<f64>,
 }
@@ -49,7 +50,7 @@ pub struct Workspace {
     scaled: Vec<f32>,
     ping: Vec<f32>,
     pong: Vec<f32>,
-    skip: Vec<f32>,
+    skip: Vec<f64>,
     projected: Vec<f32>,
 }
 
@@ -62,6 +63,33 @@ pub struct SeriesEstimates {
     pub columns: Vec<Vec<f64>>,
     /// Whether the window is inside the model's envelope; empty when it has none.
     pub inside: Vec<bool>,
+}
+
+/// Mean square of the coordinates of each group.
+pub fn group_squares<'a>(
+    groups: &'a [EnvelopeGroup],
+    coordinates: &'a [f32],
+) -> impl Iterator<Item = f64> + 'a {
+    let mut rest = coordinates;
+    groups.iter().map(move |group| {
+        let (head, tail) = rest.split_at(group.components);
+        rest = tail;
+        let sum: f64 = head.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+        sum / group.components.max(1) as f64
+    })
+}
+
+fn scaled_limits(config: &ModelConfig) -> Vec<[f64; 2]> {
+    let limits = |input: usize| {
+        let channel = &config.inputs[input];
+        config
+            .input_limits
+            .get(input)
+            .map_or([f64::NEG_INFINITY, f64::INFINITY], |limits| {
+                limits.map(|value| (value - channel.offset) / channel.scale)
+            })
+    };
+    (0..config.inputs.len()).map(limits).collect()
 }
 
 /// Layers with nothing between them are one linear map: `W₂ (W₁ x + b₁) + b₂ = (W₂ W₁) x + (W₂ b₁ + b₂)`,
@@ -110,25 +138,25 @@ impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let empty = LinearWeights::default();
-        let skip = weights.skip.as_ref();
-        let mut layers = Vec::with_capacity(weights.layers.len().max(1));
-        let folded = fold(config, weights);
-        for (position, (activations, map)) in folded.iter().enumerate() {
-            let tail = skip.filter(|_| position == 0).unwrap_or(&empty);
-            layers.push(PackedLayer::with_linear_tail(map, activations, tail));
-        }
-        if layers.is_empty() {
-            layers.push(PackedLayer::new(skip.unwrap_or(&empty), &[]));
-        }
+        let layers = fold(config, weights)
+            .iter()
+            .map(|(activations, map)| PackedLayer::new(map, activations))
+            .collect();
+        let skip = weights.skip.as_ref().map(|map| {
+            SkipKernel::new(
+                map,
+                config.schedule.as_ref(),
+                &config.inputs,
+                config.targets.len(),
+            )
+        });
         let envelope = config
             .envelope
             .as_ref()
             .zip(auxiliary.envelope.as_ref())
             .map(|(envelope, map)| EnvelopeKernel {
                 projection: PackedLayer::new(map, &[]),
-                components: envelope.components,
-                limit: envelope.limit,
+                groups: envelope.groups.clone(),
                 min: envelope.min.clone(),
                 max: envelope.max.clone(),
             });
@@ -141,9 +169,9 @@ impl Predictor {
                 .map(|channel| (channel.offset, channel.scale.recip()))
                 .collect(),
             targets: Scaling::from_config(&config.targets),
-            first_width: folded.first().map_or(0, |(_, map)| map.bias.len()),
-            has_skip: skip.is_some(),
+            limits: scaled_limits(config),
             layers,
+            skip,
             intervals: config.intervals.clone(),
             envelope,
         }
@@ -194,7 +222,7 @@ impl Predictor {
             scaled: vec![0.0; BLOCK_ROWS * self.targets.len()],
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
-            skip: vec![0.0; BLOCK_ROWS * self.targets.len()],
+            skip: vec![0.0; BLOCK_ROWS * self.skip.as_ref().map_or(0, SkipKernel::padded)],
             projected: vec![
                 0.0;
                 self.envelope
@@ -321,7 +349,9 @@ impl Predictor {
             for (value, slot) in column.iter().zip(slots) {
                 #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
                 {
-                    *slot = ((value - offset) * inverse) as f32;
+                    *slot = ((value - offset) * inverse)
+                        .clamp(self.limits[channel][0], self.limits[channel][1])
+                        as f32;
                 }
             }
         }
@@ -361,8 +391,8 @@ impl Predictor {
         table.half_widths.get(class).copied()
     }
 
-    /// Network output for scaled windows that begin `stride` values apart, one row of scaled
-    /// targets per window in `workspace.scaled`.
+    /// Estimates for scaled windows that begin `stride` values apart, one row of scaled targets per
+    /// window in `workspace.scaled`.
     fn block(&self, x: &[f32], stride: usize, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
         let Workspace {
@@ -372,31 +402,24 @@ impl Predictor {
             skip,
             ..
         } = workspace;
-        self.layers[0].forward(x, stride, rows, ping);
-        let padded = self.layers[0].padded();
-        if self.has_skip {
-            for (row, out) in skip[..rows * targets].chunks_mut(targets).enumerate() {
-                out.copy_from_slice(&ping[row * padded + self.first_width..][..targets]);
+        let scaled = &mut scaled[..rows * targets];
+        if let Some((layer, others)) = self.layers.split_first() {
+            layer.forward(x, stride, rows, ping);
+            let (mut from, mut to) = (ping, pong);
+            let mut width = layer.padded();
+            for layer in others {
+                layer.forward(from, width, rows, to);
+                width = layer.padded();
+                std::mem::swap(&mut from, &mut to);
             }
-        }
-        let (mut from, mut to) = (ping, pong);
-        let mut width = padded;
-        for layer in &self.layers[1..] {
-            layer.forward(from, width, rows, to);
-            width = layer.padded();
-            std::mem::swap(&mut from, &mut to);
-        }
-        if self.first_width == 0 {
-            scaled[..rows * targets].copy_from_slice(&skip[..rows * targets]);
-            return;
-        }
-        for (row, out) in scaled[..rows * targets].chunks_mut(targets).enumerate() {
-            out.copy_from_slice(&from[row * width..][..targets]);
-            if self.has_skip {
-                for (o, s) in out.iter_mut().zip(&skip[row * targets..]) {
-                    *o += s;
-                }
+            for (row, out) in scaled.chunks_mut(targets).enumerate() {
+                out.copy_from_slice(&from[row * width..][..targets]);
             }
+        } else {
+            scaled.fill(0.0);
+        }
+        if let Some(kernel) = &self.skip {
+            kernel.add(x, stride, rows, skip, scaled);
         }
     }
 
@@ -419,8 +442,9 @@ impl Predictor {
         let padded = envelope.projection.padded();
         let rows = workspace.projected[..rows * padded].chunks(padded);
         for (flag, row) in inside.iter_mut().zip(rows) {
-            let squares: f32 = row[..envelope.components].iter().map(|v| v * v).sum();
-            *flag = f64::from(squares) <= envelope.limit * envelope.components as f64;
+            *flag = group_squares(&envelope.groups, row)
+                .zip(&envelope.groups)
+                .all(|(square, group)| square <= group.limit);
         }
     }
 
@@ -461,8 +485,9 @@ impl Predictor {
     fn scale_rows<T: Copy + Into<f64>>(&self, rows: &[T], out: &mut [f32]) {
         let width = self.inputs.len();
         for (row, slots) in rows.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-            for ((&value, slot), (offset, inverse)) in row.iter().zip(slots).zip(&self.input_maps) {
-                *slot = ((value.into() - offset) * inverse) as f32;
+            let maps = self.input_maps.iter().zip(&self.limits);
+            for ((&value, slot), ((offset, inverse), [low, high])) in row.iter().zip(slots).zip(maps) {
+                *slot = ((value.into() - offset) * inverse).clamp(*low, *high) as f32;
             }
         }
     }

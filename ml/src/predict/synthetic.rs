@@ -2,7 +2,7 @@
 //! a model estimates does not matter and a training would only take time.
 
 use super::Predictor;
-use crate::model::weights::{Auxiliary, LinearWeights, Weights};
+use crate::model::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use crate::model::{ModelError, write};
 use crate::network::init::initial_parameters;
 use crate::structure::{Structure, StructureError};
@@ -72,7 +72,7 @@ impl SyntheticModel {
             layers: random(&layers, spec.seed),
             skip: structure
                 .linear_skip
-                .then(|| random(&[map("skip", values, spec.targets)], spec.seed + 1).remove(0)),
+                .then(|| in_f64(&random(&[map("skip", values, spec.targets)], spec.seed + 1).remove(0))),
         };
         let linear = random(
             &[
@@ -161,6 +161,13 @@ fn random(layers: &[DenseLayer], seed: u64) -> Vec<LinearWeights> {
         .collect()
 }
 
+fn in_f64(map: &LinearWeights) -> SkipWeights {
+    SkipWeights {
+        weight: map.weight.iter().map(|&w| f64::from(w)).collect(),
+        bias: map.bias.iter().map(|&b| f64::from(b)).collect(),
+    }
+}
+
 fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> ModelConfig {
     let channels = |all: &[(&str, &str, f64, f64)]| -> Vec<serde_json::Value> {
         all.iter()
@@ -208,7 +215,9 @@ fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> Mod
         "validation_least_squares": [],
         "intervals": half_widths,
         "envelope": {
-            "components": ENVELOPE_COMPONENTS, "limit": 1e3, "min": bounds(-1.0), "max": bounds(1.0),
+            "components": ENVELOPE_COMPONENTS,
+            "groups": [{ "components": ENVELOPE_COMPONENTS, "limit": 1e3 }],
+            "min": bounds(-1.0), "max": bounds(1.0),
         },
         "golden": [],
     });
@@ -320,8 +329,8 @@ mod tests {
             }
         }
         if let Some(skip) = &model.weights.skip {
-            for (v, s) in x.iter_mut().zip(apply(skip, &scaled)) {
-                *v += s;
+            for (v, (row, b)) in x.iter_mut().zip(skip.weight.chunks(scaled.len()).zip(&skip.bias)) {
+                *v += b + row.iter().zip(&scaled).map(|(w, v)| w * v).sum::<f64>();
             }
         }
         x.iter()

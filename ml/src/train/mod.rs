@@ -14,6 +14,7 @@ use crate::model::ModelError;
 use crate::network::init::epoch_order;
 use crate::network::{NetworkTensors, batch_tensor};
 use crate::runs::RunsError;
+use crate::scheduled::NormalEquationsError;
 use crate::structure::StructureError;
 use crate::window::WindowError;
 use adam::Adam;
@@ -81,6 +82,9 @@ pub enum TrainError {
     /// The windows' covariance.
     #[error(transparent)]
     Spectrum(#[from] SpectrumError),
+    /// The skip connection's coefficients.
+    #[error(transparent)]
+    NormalEquations(#[from] NormalEquationsError),
     /// Nothing to feed or to learn.
     #[error("the data set has no {what} channel by default; name the {what}s")]
     NoChannels {
@@ -382,7 +386,7 @@ fn epoch(
     Ok(sum / seen as f64)
 }
 
-/// Mean squared error of a batch, its gradient written to `gradient`. Large batches are cut into
+/// Loss of a batch, its gradient written to `gradient`. Large batches are cut into
 /// parts that run at the same time and are summed in order.
 pub fn batch_gradient(problem: &Problem, parameters: &[f32], batch: &[u32], gradient: &mut [f32]) -> f64 {
     let divisor = (batch.len() * problem.spec.targets.len()) as f32;
@@ -416,6 +420,7 @@ fn part_gradient(
     NetworkTensors::new(&problem.layers, parameters, &device).loss_and_gradient(
         Tensor::from_inner(windows),
         batch_tensor(wanted, batch.len(), &device),
+        problem.loss,
         divisor,
         gradient,
     )
@@ -485,7 +490,7 @@ fn validation_loss(problem: &Problem, parameters: &[f32]) -> f64 {
         sum += values
             .iter()
             .zip(&wanted)
-            .map(|(o, w)| f64::from(o - w).powi(2))
+            .map(|(o, w)| problem.loss.value(f64::from(o - w)))
             .sum::<f64>();
     }
     sum / (count * problem.spec.targets.len()) as f64

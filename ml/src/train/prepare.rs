@@ -1,10 +1,13 @@
 //! From a data set and a specification to a well-posed training problem.
 
 use super::TrainError;
+use crate::evaluate::metrics::quantile;
 use crate::least_squares::{LinearMap, Spectrum, TargetRows, WindowMoments};
+use crate::network::Loss;
 use crate::network::init::initial_parameters;
 use crate::runs::Runs;
 use crate::scaling::Scaling;
+use crate::scheduled::{RANGE_FACTOR, Sample, ScheduledMap};
 use crate::structure::Structure;
 use crate::window::{Series, WindowError, Windows, window_steps};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
@@ -15,7 +18,7 @@ use hydroflex_openapi::model::DenseLayer;
 pub const MIN_TRAIN_RUNS: usize = 2;
 
 /// Steps of a training of our own when neither epochs nor a time limit are given.
-const DEFAULT_STEPS: usize = 6000;
+const DEFAULT_STEPS: usize = 3000;
 /// Most epochs of the paper's recipe.
 const PAPER_EPOCHS: usize = 1000;
 /// The paper's recipe stops at this training loss.
@@ -98,9 +101,15 @@ pub struct Problem {
     pub moments: WindowMoments,
     /// Their spectrum.
     pub spectrum: Spectrum,
-    /// Least squares on the window: baseline of every model, skip connection of ours.
+    /// Least squares on the window: baseline of every model.
     pub linear: LinearMap,
-    /// Standard deviation of what the network learns, per target, in scaled units (1 without skip).
+    /// The same with coefficients that follow the pose: the skip connection of our network.
+    pub skip: Option<ScheduledMap>,
+    /// What is minimised.
+    pub loss: Loss,
+    /// Values at which inputs are held, in their columns' units; none for the paper's structures.
+    pub input_limits: Vec<[f64; 2]>,
+    /// Typical size of what the network learns, per target, in scaled units (1 without skip).
     pub wanted_scale: Vec<f64>,
     /// Rows that whiten a window, and what they make of the mean window; empty for the paper's recipe.
     pub whitening: Whitening,
@@ -205,10 +214,21 @@ impl Problem {
         let judge = WindowMoments::gather(&validation.series, &validation.windows, &validation.targets);
         let spectrum = Spectrum::new(&moments)?;
         let linear = spectrum.best_map(&moments, &judge);
-        let skip = structure.linear_skip.then_some(&linear);
-        let wanted_scale = wanted_scale(&moments, skip);
-        for part in [&mut train, &mut validation] {
-            part.wanted = wanted(part, steps, skip, &wanted_scale);
+        let skip = if structure.linear_skip {
+            Some(ScheduledMap::fit(
+                sample(&train, &every),
+                sample(&validation, &validation.windows),
+                &input_scaling,
+                &slow_inputs(&train_inputs),
+            )?)
+        } else {
+            None
+        };
+        let errors =
+            [&train, &validation].map(|part| skip_errors(part, steps, skip.as_ref(), &input_scaling));
+        let wanted_scale = wanted_scale(&train, steps, skip.as_ref(), &errors[0]);
+        for (part, errors) in [&mut train, &mut validation].into_iter().zip(errors) {
+            part.wanted = in_units_of(&errors, &wanted_scale);
         }
 
         let whitening = if published {
@@ -227,7 +247,6 @@ impl Problem {
         let parameters = initial_parameters(&layers, spec.seed, 1.0);
         Ok(Self {
             spec,
-            structure,
             steps,
             input_scaling,
             target_scaling,
@@ -236,6 +255,18 @@ impl Problem {
             moments,
             spectrum,
             linear,
+            skip,
+            input_limits: if structure.linear_skip {
+                input_limits(&train_inputs)
+            } else {
+                Vec::new()
+            },
+            loss: if structure.linear_skip {
+                Loss::PseudoHuber
+            } else {
+                Loss::Square
+            },
+            structure,
             wanted_scale,
             whitening,
             layers,
@@ -317,40 +348,94 @@ fn target_rows(runs: &Runs, scaling: &Scaling) -> TargetRows {
     TargetRows { width, values }
 }
 
-/// Standard deviation of the linear map's error on the training windows; 1 without skip. A target
-/// that the map explains to the last bit keeps a floor far below anything measurable.
-fn wanted_scale(moments: &WindowMoments, skip: Option<&LinearMap>) -> Vec<f64> {
-    const FLOOR: f64 = 1e-7;
-    skip.map_or_else(
-        || vec![1.0; moments.target_mean.len()],
-        |map| {
-            moments
-                .mean_squared_error(map)
-                .iter()
-                .map(|mse| mse.sqrt().max(FLOOR))
-                .collect()
-        },
-    )
+fn sample<'a>(part: &'a Part, windows: &'a Windows) -> Sample<'a> {
+    Sample {
+        series: &part.series,
+        windows,
+        targets: &part.targets,
+    }
 }
 
-fn wanted(part: &Part, steps: usize, skip: Option<&LinearMap>, scale: &[f64]) -> Vec<f32> {
+/// Inputs that tell the pose: lengths of cylinders, else angles.
+fn slow_inputs(inputs: &Runs) -> Vec<usize> {
+    let named = |prefix: &str| -> Vec<usize> {
+        inputs
+            .channels
+            .iter()
+            .enumerate()
+            .filter(|(_, channel)| channel.name.starts_with(prefix))
+            .map(|(position, _)| position)
+            .collect()
+    };
+    let lengths = named("length_");
+    if lengths.is_empty() {
+        named("angle_")
+    } else {
+        lengths
+    }
+}
+
+/// The training range of each input, widened as the slow signals' is.
+fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
+    (0..runs.channels.len())
+        .map(|input| {
+            let values = || {
+                runs.runs
+                    .iter()
+                    .flat_map(|run| run.columns[input].iter().copied())
+            };
+            let low = values().fold(f64::INFINITY, f64::min);
+            let high = values().fold(f64::NEG_INFINITY, f64::max);
+            let room = 0.5 * (RANGE_FACTOR - 1.0) * (high - low);
+            [low - room, high + room]
+        })
+        .collect()
+}
+
+/// What the skip leaves over of the scaled targets, row by row; the targets themselves without one.
+/// Rows that end no window are 0.
+fn skip_errors(part: &Part, steps: usize, skip: Option<&ScheduledMap>, scaling: &Scaling) -> Vec<f64> {
     let width = part.targets.width;
-    let mut wanted = vec![0.0_f32; part.targets.values.len()];
-    let mut linear = vec![0.0; width];
+    let mut errors = vec![0.0; part.targets.values.len()];
+    let mut estimate = vec![0.0; width];
     for index in 0..part.windows.len() {
         let first = part.windows.first_row(index);
         let row = first + steps - 1;
         if let Some(map) = skip {
-            map.apply(part.series.window(first, steps), &mut linear);
+            map.apply(scaling, part.series.window(first, steps), &mut estimate);
         }
         for t in 0..width {
-            #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-            {
-                wanted[row * width + t] = ((part.targets.row(row)[t] - linear[t]) / scale[t]) as f32;
-            }
+            errors[row * width + t] = part.targets.row(row)[t] - estimate[t];
         }
     }
-    wanted
+    errors
+}
+
+/// Median size of what the skip leaves over on the training windows, per target; 1 without skip:
+/// rare windows with large errors do not set the scale of the others. A target that the skip explains to the last bit keeps a floor far below anything measurable.
+fn wanted_scale(part: &Part, steps: usize, skip: Option<&ScheduledMap>, errors: &[f64]) -> Vec<f64> {
+    const FLOOR: f64 = 1e-7;
+    let width = part.targets.width;
+    if skip.is_none() {
+        return vec![1.0; width];
+    }
+    (0..width)
+        .map(|t| {
+            let mut sizes: Vec<f64> = (0..part.windows.len())
+                .map(|index| part.windows.first_row(index) + steps - 1)
+                .map(|row| errors[row * width + t].abs())
+                .collect();
+            quantile(&mut sizes, 0.5).max(FLOOR)
+        })
+        .collect()
+}
+
+#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+fn in_units_of(errors: &[f64], scale: &[f64]) -> Vec<f32> {
+    errors
+        .chunks(scale.len())
+        .flat_map(|row| row.iter().zip(scale).map(|(e, s)| (e / s) as f32))
+        .collect()
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]

@@ -14,6 +14,7 @@ pub mod train;
 pub mod evaluate;
 pub mod model;
 pub mod predict;
+pub mod paper;
 mod log;
 
 use anyhow::Context as _;

@@ -1,6 +1,6 @@
 //! `hydroflex simulate`: given runs, no service.
 
-mod run_table;
+pub(crate) mod run_table;
 
 use anyhow::{Context, bail, ensure};
 use hydroflex_dataset::{

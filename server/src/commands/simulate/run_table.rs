@@ -2,15 +2,19 @@
 //! `valve_<name>_ratio` (list of doubles, one per sample).
 
 use anyhow::{Context, bail, ensure};
-use arrow::array::{Array, ArrayRef, AsArray, Float64Array, RecordBatch, UInt64Array};
+use arrow::array::{
+    Array, ArrayRef, AsArray, Float64Array, Float64Builder, ListBuilder, RecordBatch, UInt64Array,
+};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use hydroflex_openapi::machine::MachineFile;
 use hydroflex_sim::trajectory::RunInput;
+use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Reads the table and checks every value; runs are sorted by `run_id`.
 ///
@@ -37,6 +41,44 @@ pub(super) fn read(path: &Path, machine: &MachineFile) -> anyhow::Result<Vec<Run
         );
     }
     Ok(runs)
+}
+
+/// Writes runs as a table that [`read`] and other tools take.
+///
+/// # Errors
+/// The file cannot be written.
+pub(crate) fn write(path: &Path, machine: &MachineFile, runs: &[RunInput]) -> anyhow::Result<()> {
+    let angle = |a: usize| -> ArrayRef {
+        Arc::new(Float64Array::from_iter_values(
+            runs.iter().map(|run| run.angles_rad[a]),
+        ))
+    };
+    let valve = |v: usize| -> ArrayRef {
+        let mut lists = ListBuilder::new(Float64Builder::new());
+        for run in runs {
+            lists.values().append_slice(&run.valves_ratio[v]);
+            lists.append(true);
+        }
+        Arc::new(lists.finish())
+    };
+    let run_ids: ArrayRef = Arc::new(UInt64Array::from_iter_values(runs.iter().map(|run| run.run_id)));
+    let payloads: ArrayRef = Arc::new(Float64Array::from_iter_values(
+        runs.iter().map(|run| run.payload_kg),
+    ));
+    let mut columns = vec![
+        ("run_id".to_owned(), run_ids),
+        ("payload_kg".to_owned(), payloads),
+    ];
+    let angles = names("angle", &machine.angles, "rad", |a| &a.name);
+    columns.extend(angles.into_iter().enumerate().map(|(a, name)| (name, angle(a))));
+    let valves = names("valve", &machine.cylinders, "ratio", |c| &c.name);
+    columns.extend(valves.into_iter().enumerate().map(|(v, name)| (name, valve(v))));
+    let batch = RecordBatch::try_from_iter(columns).context("run table")?;
+    let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+    let mut writer = ArrowWriter::try_new(file, batch.schema(), None).context("run table")?;
+    writer.write(&batch).context("run table")?;
+    writer.close().context("run table")?;
+    Ok(())
 }
 
 /// The columns of a batch, of the right types and without nulls.
@@ -184,11 +226,9 @@ fn fits(from: &DataType, wanted: &DataType) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use arrow::array::{Float64Builder, Int64Array, ListBuilder};
+    use arrow::array::Int64Array;
     use arrow::datatypes::{Field, Schema};
     use hydroflex_sim::machine::Machine;
-    use parquet::arrow::ArrowWriter;
-    use std::sync::Arc;
 
     struct Row(i64, f64, f64, Vec<f64>);
 
