@@ -169,7 +169,7 @@ fn planned(simulator: &Simulator, payload_kg: f64) -> Vec<RunInput> {
     .expect("a valid job");
     let file = simulator.machine().file();
     (0..u64::from(RUNS))
-        .map(|index| plan_run(&spec, file, index).expect("a valid plan"))
+        .map(|index| plan_run(&spec, file, simulator, index).expect("a valid plan"))
         .collect()
 }
 
