@@ -141,6 +141,7 @@ async fn serve(folder: PathBuf) -> anyhow::Result<()> {
         cache: data.path().join("cache"),
         workers: 1,
         lease: Duration::from_secs(10),
+        most_jobs: 1000,
     };
     let router = hydroflex_server::app(AppState::new(Coordinator::new(ledger, blobs, config)));
     let listener = TcpListener::bind("127.0.0.1:0").await?;
