@@ -221,13 +221,21 @@ fn interfaces_sensors_and_angles_that_do_not_fit_the_mesh_are_refused() {
 
 #[test]
 fn text_from_outside_cannot_name_a_file() {
-    for mesh in ["{ file = \"/etc/passwd\" }", "{ given = \"any\" }"] {
+    for (mesh, says) in [
+        (
+            "{ file = \"/etc/passwd\" }",
+            "a machine sent as text cannot name a file; upload the mesh and name it in the job's `meshes`, or use a \
+             built-in one (lift-boom)",
+        ),
+        (
+            "{ given = \"any\" }",
+            "body `boom` needs a mesh: any; give it with --mesh boom=FILE, over REST with POST /v1/meshes and the \
+             job's `meshes`",
+        ),
+    ] {
         assert_eq!(
             refusal_on_mesh("{ built_in = \"lift-boom\" }", mesh),
-            format!(
-                "machine:{}: body[0].mesh: a machine sent as text cannot name a file; use a built-in mesh (lift-boom)",
-                line_of(BUILT_IN, "mesh = {")
-            )
+            format!("machine:{}: body[0].mesh: {says}", line_of(BUILT_IN, "mesh = {"))
         );
     }
     assert!(
@@ -248,10 +256,9 @@ fn missing_machines_and_meshes_are_named() {
         "no machine is called `lift-bom` and there is no such file; built in: lift-boom, lift-boom-published, crane-published"
     );
     assert!(load_error("none.toml", &[]).starts_with("cannot read none.toml"));
-    assert!(
-        load_error("lift-boom-published", &[])
-            .contains("body `boom` needs a mesh: the published boom mesh, Job-1.inp; give it with --mesh FILE or --mesh boom=FILE")
-    );
+    assert!(load_error("lift-boom-published", &[]).contains(
+        "body `boom` needs a mesh: the published boom mesh, Job-1.inp; give it with --mesh boom=FILE"
+    ));
     assert!(load_error("lift-boom-published", &["absent.inp"]).contains("cannot read the mesh absent.inp"));
     assert_eq!(
         load_error("crane-published", &["a.inp"]),
