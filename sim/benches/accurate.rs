@@ -55,6 +55,8 @@ const CHANNELS: [(usize, &str); 11] = [
 
 /// Processor time of this thread, µs.
 fn processor_us() -> f64 {
+    // Linux brings a running thread's account up to date at ticks of some milliseconds, and when it yields.
+    std::thread::yield_now();
     let usage = getrusage(UsageWho::RUSAGE_THREAD).expect("getrusage knows this thread");
     (usage.user_time().num_microseconds() + usage.system_time().num_microseconds()) as f64
 }

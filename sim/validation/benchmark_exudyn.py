@@ -222,8 +222,8 @@ def table(a, median, steps, errors, instruction_set, name):
         f"Written by `python sim/validation/benchmark_exudyn.py --rounds {a.rounds} --runs {a.runs} --seed {a.seed} --fine-s {a.fine_s:g}` on "
         f"{date.today().isoformat()}: {processor()}, {os.cpu_count()} cores, {platform.system()}, "
         f"{instruction_set} instructions in the batch; Exudyn {exu.__version__}, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}. Load average at the end {os.getloadavg()[0]:.0f}: above the number of cores, other programs "
-        "slowed both by up to twice; compare the ratios.",
+        f"NumPy {np.__version__}. Load average at the end {os.getloadavg()[0]:.0f}; other programs slow both, "
+        "so compare the ratios.",
         "",
         f"Machine: `sim/validation/lift-boom/boom.toml` (`{name}`), random valve signals of 1 s, samples every 5 ms, "
         "one thread. Milliseconds of user CPU per run, medians, hydroflex and Exudyn in turns. Reducing the body "
