@@ -756,7 +756,7 @@ fn random_faults_lose_nothing_and_change_no_byte() {
 /// short.
 fn report(path: &Path, tally: &Tally, setups: &[Setup], seed: u64) -> std::io::Result<()> {
     let text = format!(
-        "# Faults injected, and what they changed: nothing\n\n\
+        "# Faults injected, and what they changed\n\n\
          Each job is {RUNS} runs of the built-in boom on three or four worker processes and, on PostgreSQL, two\n\
          coordinators. After each job every run must be accounted for once in the ledger, every file of the data\n\
          set must have its SHA-256, no object may be left that nobody owns, and the data set must be byte for\n\
