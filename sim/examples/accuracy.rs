@@ -55,7 +55,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let ours = finished(model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
         let converged = finished(model.run_batch(&inputs, SAMPLE_S, CONVERGED, &mut ws));
         let count = ours.len().max(1) as f64;
-        let mean = |of: &dyn Fn(&Trajectory) -> u64| ours.iter().flatten().map(of).sum::<u64>() as f64 / count;
+        let mean =
+            |of: &dyn Fn(&Trajectory) -> u64| ours.iter().flatten().map(of).sum::<u64>() as f64 / count;
         println!(
             "{machine}, {payload_kg} kg, {} runs with seed {seed}: {:.0} steps, {:.1} rejected, {:.0} factorisations a run",
             inputs.len(),
@@ -77,9 +78,23 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 .map(|input| simulator.run(input, &settings).ok())
                 .collect();
             println!("  against the general path's trapezoidal rule with {step_s} s:");
-            report(&simulator, &inputs[..few], &ours[..few], &other, worst, Some(&scales));
+            report(
+                &simulator,
+                &inputs[..few],
+                &ours[..few],
+                &other,
+                worst,
+                Some(&scales),
+            );
             println!("  and that of tolerance {CONVERGED:e} against it:");
-            report(&simulator, &inputs[..few], &converged[..few], &other, worst, Some(&scales));
+            report(
+                &simulator,
+                &inputs[..few],
+                &converged[..few],
+                &other,
+                worst,
+                Some(&scales),
+            );
         }
     }
     Ok(())
@@ -112,7 +127,9 @@ fn report(
         let ranges = other.iter().flatten().map(|run| {
             let (least, most) = run.columns[k]
                 .iter()
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &x| (a.min(x), b.max(x)));
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &x| {
+                    (a.min(x), b.max(x))
+                });
             most - least
         });
         let scale = scales.map_or_else(|| median(ranges.collect()), |s| s[k - 1]);
@@ -137,13 +154,18 @@ fn report(
         errors.sort_by(|a, b| b.0.total_cmp(&a.0));
         let quantile = |q: f64| {
             let n = errors.len();
-            errors.get(((1.0 - q) * n as f64) as usize).map_or(f64::NAN, |e| e.0)
+            errors
+                .get(((1.0 - q) * n as f64) as usize)
+                .map_or(f64::NAN, |e| e.0)
         };
         let places: Vec<String> = errors
             .iter()
             .take(worst)
             .map(|(most, index, at, first)| {
-                let flags = ours[*index].as_ref().map(|run| run.flags.clone()).unwrap_or_default();
+                let flags = ours[*index]
+                    .as_ref()
+                    .map(|run| run.flags.clone())
+                    .unwrap_or_default();
                 let flags: Vec<&str> = flags.iter().map(|f| f.as_str()).collect();
                 format!(
                     "{most:.1e} in run {} at {:.3} s (since {:.3} s; {})",

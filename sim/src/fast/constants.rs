@@ -129,6 +129,8 @@ pub(super) struct Cylinder {
     pub(super) spring: [f64; 4],
     /// Friction law.
     pub(super) friction: FrictionSpec,
+    /// Speed over which friction turns over, m/s; 0 if that makes no difference.
+    pub(super) reversal_m_per_s: f64,
     /// End stops, if any.
     pub(super) stop: Option<EndStopSpec>,
     /// Lengths outside which the valve is shut.
@@ -172,9 +174,40 @@ impl Cylinder {
             damping: spec.damping_n_s_per_m,
             spring,
             friction: spec.friction,
+            reversal_m_per_s: reversal_m_per_s(
+                spec,
+                piston * (spec.valve.supply_pressure_pa - spec.valve.tank_pressure_pa),
+            ),
             stop: spec.end_stop,
             cutoff_m: spec.stroke_cutoff.map(|c| [c.min_length_m, c.max_length_m]),
             initial_pa: spec.initial_pressure_pa,
         }
+    }
+}
+
+/// Speed over which friction turns over, m/s; 0 if its jump is below a thousandth of the largest
+/// cylinder force. A straight transition of half-width v has the slope of Brown and McPhee's with 4 v.
+fn reversal_m_per_s(spec: &CylinderSpec, force_n: f64) -> f64 {
+    let (jump_n, width_m_per_s) = match spec.friction {
+        FrictionSpec::None => (0.0, 0.0),
+        FrictionSpec::BrownMcphee {
+            static_n,
+            transition_velocity_m_per_s,
+            ..
+        } => (2.0 * static_n, transition_velocity_m_per_s),
+        FrictionSpec::Stribeck {
+            dynamic_n,
+            static_offset_n,
+            regularisation_velocity_m_per_s,
+            ..
+        } => (
+            2.0 * (dynamic_n + static_offset_n),
+            4.0 * regularisation_velocity_m_per_s,
+        ),
+    };
+    if jump_n > 1e-3 * force_n {
+        width_m_per_s
+    } else {
+        0.0
     }
 }

@@ -37,7 +37,7 @@ impl Common {
     /// and the stiff modes lower the order, so the local tolerance falls with its square; the factor
     /// is measured on the published boom (`sim/theory/minimal_coordinates.md`, §6).
     pub(super) fn new(sample_time_s: f64, tolerance: f64) -> Self {
-        let local = (250.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
+        let local = (400.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
         Self {
             sample_time_s,
             tolerance,
@@ -204,6 +204,8 @@ fn advance<L: Lane, const A: usize, const B: usize, const Q: usize>(
         ],
         rate: both(|r| &r.p_raw),
         alpha: buffer.alpha.get(lane),
+        speed_m_per_s: buffer.end.speed.get(lane),
+        speed_range_m_per_s: [buffer.speed_range[0].get(lane), buffer.speed_range[1].get(lane)],
         length_m: buffer.end.length.get(lane),
         finite: (next.p[0].get(lane) + next.p[1].get(lane) + next.omega.get(lane)).is_finite(),
     };

@@ -21,6 +21,8 @@ pub(super) struct StepBuffer<L, const A: usize, const B: usize, const Q: usize> 
     pub(super) alpha: L,
     /// Squared error estimate over tolerance-free scales.
     pub(super) error2: L,
+    /// Lowest and highest rod speed among the stages, m/s.
+    pub(super) speed_range: [L; 2],
     factors: Factors<L, A, B, Q>,
     increments: [Point<L, A, B, Q>; STAGES],
     rhs: Point<L, A, B, Q>,
@@ -35,6 +37,7 @@ impl<L: Lane, const A: usize, const B: usize, const Q: usize> StepBuffer<L, A, B
             next: Point::zero(),
             alpha: L::splat(0.0),
             error2: L::splat(0.0),
+            speed_range: [L::splat(0.0); 2],
             factors: Factors::zero(),
             increments: [Point::zero(); STAGES],
             rhs: Point::zero(),
@@ -62,6 +65,7 @@ pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
         h * regime.opening_per_s * slopes.gain[1] * slopes.stiffness[1],
     ];
     w.next = *y;
+    w.speed_range = [w.start.speed; 2];
     for stage in 0..method.stages {
         gather(c, method, stage, y, inverse_h, w);
         let at = if stage == 0 {
@@ -69,6 +73,12 @@ pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
         } else {
             let opening = regime.opening + L::splat(method.time[stage]) * h * regime.opening_per_s;
             evaluate::<false, _, A, B, Q>(c, &w.next, &heading, opening, regime, &mut w.end);
+            let [low, high] = w.speed_range;
+            let speed = w.end.speed;
+            w.speed_range = [
+                speed.where_less(speed, low, low),
+                speed.where_less(high, speed, high),
+            ];
             &w.end
         };
         w.rhs.theta += w.next.omega;
