@@ -239,7 +239,6 @@ pub(super) fn solve<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, 
     rhs: &Point<L, A, B, Q>,
     u: &mut Point<L, A, B, Q>,
 ) {
-    let k = |x: f64| L::splat(x);
     let (s, s2) = (f.s, f.s2);
     let coupled = L::trip(A, c.coupled.used);
     let plain = L::trip(B, c.plain.used);
