@@ -23,7 +23,7 @@ const REVERSAL_MOST: f64 = 0.7;
 /// … if the speed came closer to zero than this many, and ends within that many; farther away the
 /// acceleration has recovered.
 const REVERSAL_TOUCHES: f64 = 1.2;
-const REVERSAL_ENDS: f64 = 4.0;
+const REVERSAL_ENDS: f64 = 6.0;
 /// Change of speed, in transition velocities, that is left for the last step when another is cut.
 const REVERSAL_LEAVES: f64 = 0.4;
 /// Steps shorter than this are not cut for friction, s.
