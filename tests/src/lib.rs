@@ -22,7 +22,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Longest wait for anything. Tests wait for conditions; this only ends one that hangs.
-const PATIENCE: Duration = Duration::from_secs(240);
+const PATIENCE: Duration = Duration::from_mins(4);
 
 /// The hydroflex binary: `HYDROFLEX_BIN`, or the one built beside this test.
 ///

@@ -22,7 +22,7 @@ const LOOK: Duration = Duration::from_millis(500);
 /// Longest wait between two looks for work.
 const LONGEST_IDLE: Duration = Duration::from_millis(100);
 /// How long the database or the store may be away before a shard is given back.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// How a worker works.
 #[derive(Debug, Clone)]
@@ -53,7 +53,7 @@ pub struct RunLimits {
 impl Default for RunLimits {
     fn default() -> Self {
         Self {
-            time: Duration::from_secs(600),
+            time: Duration::from_mins(10),
             memory_bytes: 4 << 30,
         }
     }

@@ -457,11 +457,10 @@ impl<S: Sink> Publisher<S> {
             files: output.sorted(),
         };
         output.write_json("manifest.json", &manifest)?;
-        let sums: String = output
-            .sorted()
-            .iter()
-            .map(|file| format!("{}  {}\n", file.sha256, file.path))
-            .collect();
+        let mut sums = String::new();
+        for file in output.sorted() {
+            sums.extend([file.sha256.as_str(), "  ", file.path.as_str(), "\n"]);
+        }
         output.write("SHA256SUMS", sums.as_bytes())?;
         let published = Published {
             manifest,

@@ -78,7 +78,7 @@ impl Ledger {
         };
         match ledger.schema_version().await? {
             0 => Err(LedgerError::NoSchema),
-            version => ledger.refuse_newer(version).map(|()| ledger),
+            version => Self::refuse_newer(version).map(|()| ledger),
         }
     }
 
@@ -101,7 +101,7 @@ impl Ledger {
         self.pool.close().await;
     }
 
-    fn refuse_newer(&self, found: u64) -> Result<(), LedgerError> {
+    fn refuse_newer(found: u64) -> Result<(), LedgerError> {
         let known = SCHEMA.len() as u64;
         if found > known {
             Err(LedgerError::NewerSchema { found, known })
@@ -129,7 +129,7 @@ impl Ledger {
     }
 
     async fn migrate(&self) -> Result<(), LedgerError> {
-        self.refuse_newer(self.schema_version().await?)?;
+        Self::refuse_newer(self.schema_version().await?)?;
         let mut tx = self.pool.begin().await?;
         if self.engine() == Engine::Postgres {
             // Two coordinators may start at once; SQLite's write lock orders them by itself.
@@ -140,13 +140,12 @@ impl Ledger {
             &[],
         )
         .await?;
-        let done = match tx.row("SELECT version FROM hydroflex_schema", &[]).await? {
-            Some(row) => row.count("version")?,
-            None => {
-                tx.execute("INSERT INTO hydroflex_schema (version) VALUES (0)", &[])
-                    .await?;
-                0
-            }
+        let done = if let Some(row) = tx.row("SELECT version FROM hydroflex_schema", &[]).await? {
+            row.count("version")?
+        } else {
+            tx.execute("INSERT INTO hydroflex_schema (version) VALUES (0)", &[])
+                .await?;
+            0
         };
         for (index, script) in SCHEMA.into_iter().enumerate() {
             if index as u64 >= done {

@@ -1,6 +1,11 @@
 //! One suite for every engine and every store: what the ledger and its blobs promise, whatever stands
 //! below them.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 #[allow(
     dead_code,
     unreachable_pub,

@@ -104,12 +104,11 @@ pub(super) fn ready_machine(
 pub fn run(args: Args) -> anyhow::Result<()> {
     let expected = read_manifest(&args.manifest)?;
     let temporary;
-    let out = match &args.out {
-        Some(out) => out.clone(),
-        None => {
-            temporary = tempfile::tempdir().context("cannot make a temporary directory")?;
-            temporary.path().join("dataset")
-        }
+    let out = if let Some(out) = &args.out {
+        out.clone()
+    } else {
+        temporary = tempfile::tempdir().context("cannot make a temporary directory")?;
+        temporary.path().join("dataset")
     };
     let published = make(&args, &expected, &out)?;
     let differing = compare(&expected, &published);

@@ -33,7 +33,7 @@ use watch::Watch;
 const BUSY_TICK: Duration = Duration::from_millis(50);
 /// How often objects are looked for that a worker put after its job was over and cleaned up: rare, and
 /// in nobody's way.
-const SWEEP: Duration = Duration::from_secs(60);
+const SWEEP: Duration = Duration::from_mins(1);
 /// And when there is none; whoever accepts a job calls.
 const IDLE_TICK: Duration = Duration::from_millis(500);
 

@@ -98,9 +98,10 @@ impl PublishFailure {
     pub fn is_permanent(&self) -> bool {
         match self {
             Self::Ledger(error) => !error.is_transient(),
-            Self::Blob(_) | Self::Scratch { .. } => false,
             // A full disk is a reason to wait, wherever it shows.
-            Self::Write(PublishError::Sink { .. } | PublishError::Parquet { .. }) => false,
+            Self::Blob(_)
+            | Self::Scratch { .. }
+            | Self::Write(PublishError::Sink { .. } | PublishError::Parquet { .. }) => false,
             _ => true,
         }
     }

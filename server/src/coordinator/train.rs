@@ -89,7 +89,7 @@ async fn serve(
             }
             Ok(None) => {}
             Err(error) if error.is_transient() => {
-                tracing::warn!(%error, "the database is away; trying again")
+                tracing::warn!(%error, "the database is away; trying again");
             }
             Err(error) => return Err(error.into()),
         }

@@ -89,7 +89,7 @@ mod tests {
         let start = Instant::now();
         let mut watch = Watch::new(Duration::from_secs(3));
         assert!(watch.look(start, &[beat("a", 1)]).is_empty());
-        let an_hour_later = start + Duration::from_secs(3600);
+        let an_hour_later = start + Duration::from_hours(1);
         assert!(watch.look(an_hour_later, &[beat("a", 1)]).is_empty());
     }
 }

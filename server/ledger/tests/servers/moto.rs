@@ -22,6 +22,7 @@ pub fn shared() -> Option<&'static Moto> {
 
 impl Moto {
     /// Starts a server; `None` where moto is not installed.
+    #[allow(clippy::zombie_processes, reason = "it serves until this process is gone")]
     pub fn start() -> Option<Self> {
         let Some(program) = program() else {
             eprintln!("moto is not installed: its part of the suite is left out (tests/run.sh installs it)");
@@ -39,7 +40,7 @@ impl Moto {
         when_we_are_gone(&format!("kill -9 {}", process.id()), &nothing);
         let start = Instant::now();
         while TcpStream::connect(("127.0.0.1", port)).is_err() {
-            assert!(start.elapsed() < Duration::from_secs(60), "moto does not start");
+            assert!(start.elapsed() < Duration::from_mins(1), "moto does not start");
             std::thread::sleep(Duration::from_millis(50));
         }
         Some(Self { port })

@@ -92,7 +92,7 @@ impl Postgres {
             match process.try_wait() {
                 Ok(None) => break,
                 _ => assert!(
-                    start.elapsed() < Duration::from_secs(60),
+                    start.elapsed() < Duration::from_mins(1),
                     "PostgreSQL does not restart"
                 ),
             }
@@ -112,7 +112,7 @@ impl Postgres {
                 return;
             }
             assert!(
-                start.elapsed() < Duration::from_secs(60),
+                start.elapsed() < Duration::from_mins(1),
                 "PostgreSQL does not start"
             );
             std::thread::sleep(Duration::from_millis(50));
