@@ -269,7 +269,10 @@ async fn publish(desk: &Desk) -> (DatasetInfo, Vec<Vec<u8>>) {
         run_shards: vec![1],
     };
     let job = desk.ledger.create_job(&new, None).await.unwrap().id();
-    desk.ledger.register_worker("worker.test").await.unwrap();
+    desk.ledger
+        .register_worker("worker.test", Some("x86-64-v3"))
+        .await
+        .unwrap();
     let claim = desk.ledger.begin_shard("worker.test").await.unwrap().unwrap();
     let result = ShardResult {
         object: claim.object(),

@@ -147,7 +147,8 @@ async fn connect(url: &str, mut stop: watch::Receiver<bool>) -> anyhow::Result<O
 impl Worker {
     /// Works under one name. `None` if the name was given up by the coordinator.
     async fn live(&self, name: &str, deadline: Option<Instant>) -> Result<Option<Ended>, LedgerError> {
-        self.ledger.register_worker(name).await?;
+        let level = hydroflex_sim::instruction_set::level();
+        self.ledger.register_worker(name, Some(level)).await?;
         let alive = Arc::new(AtomicBool::new(true));
         let heart = tokio::spawn(beat(self.ledger.clone(), name.to_owned(), alive.clone()));
         let ended = self.claim_and_work(name, deadline, &alive).await;

@@ -175,7 +175,10 @@ fn make(args: &Args, expected: &Manifest, out: &Path) -> anyhow::Result<Publishe
         .context("cannot start the simulation threads")?;
     let sink = DirectorySink::create(out)
         .with_context(|| format!("--out {} must be absent or empty", out.display()))?;
-    let mut publisher = Publisher::new(machine.publish_spec((**spec).clone()), sink)?;
+    let mut publisher = Publisher::new(
+        machine.publish_spec((**spec).clone(), hydroflex_sim::instruction_set::level()),
+        sink,
+    )?;
     let bar = progress_bar(spec.settling_runs + spec.runs);
     for (kind, count) in [(RunKind::Settling, spec.settling_runs), (RunKind::Job, spec.runs)] {
         let mut first = 0;
