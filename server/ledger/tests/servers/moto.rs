@@ -67,8 +67,13 @@ impl Moto {
 
 /// The variables by which a process finds an S3 server on a port of this machine.
 pub fn environment(port: u16) -> Vec<(&'static str, String)> {
+    environment_at("127.0.0.1", port)
+}
+
+/// The same for a server of another machine.
+pub fn environment_at(host: &str, port: u16) -> Vec<(&'static str, String)> {
     vec![
-        ("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{port}")),
+        ("AWS_ENDPOINT_URL", format!("http://{host}:{port}")),
         ("AWS_REGION", "us-east-1".to_owned()),
         ("AWS_ACCESS_KEY_ID", "testing".to_owned()),
         ("AWS_SECRET_ACCESS_KEY", "testing".to_owned()),

@@ -66,6 +66,11 @@ impl Postgres {
         Some(server)
     }
 
+    /// Its port on this machine.
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
     /// URL of a new, empty database.
     pub fn database(&self, name: &str) -> String {
         // PostgreSQL cuts names at 63 bytes; ours differ before.
