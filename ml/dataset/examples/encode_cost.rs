@@ -72,6 +72,7 @@ fn main() -> Result<(), Failure> {
             sample_time_s: dataset.sample_time_s(),
             sample_type,
             split: Split::default(),
+            file_size_mb: hydroflex_dataset::cut::FILE_SIZE_MB,
             lengths: RunLengths::Listed(loaded.iter().map(|r| r.sample_count as u64).collect()),
         };
         let name = format!("{sample_type:?}").to_lowercase();
