@@ -233,7 +233,7 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
             return;
         }
         let Some(c) = bodies.constants() else { return };
-        let c = std::hint::black_box(c);
+        let c = if L::WIDTH > 1 { std::hint::black_box(c) } else { c };
         step(c, common.method, &state, step_s, &regime, buffer);
         if recording {
             read(c, &state, &buffer.start, &mut readings);
