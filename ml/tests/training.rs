@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 
 use hydroflex_ml::model::Model;
+use hydroflex_ml::predict::Predictor;
 use hydroflex_ml::runs::{RunSamples, Runs};
 use hydroflex_ml::train::prepare::TrainingData;
 use hydroflex_ml::train::{Progress, TrainError, train};
@@ -169,6 +170,44 @@ fn our_network_beats_least_squares_and_its_folder_predicts_the_same() {
         // Another blocking sums in the same order, so these agree to f32 rounding of 1e-3 m.
         assert!((single[0] - series.columns[0][w]).abs() < 1e-9 && (batch[w] - single[0]).abs() < 1e-9);
     }
+}
+
+#[test]
+fn bounds_leave_known_signals_alone_and_hold_unknown_ones() {
+    let folder = Folder::new("bounds");
+    run(&spec("best", 60), &folder.0, "model").unwrap();
+    let model = Model::load(&folder.0.join("model")).unwrap();
+    let predictor = model.predictor();
+    let mut free = model.config().clone();
+    let guard = free.guard.take().unwrap();
+    let unbounded = Predictor::new(&free, model.weights(), model.auxiliary());
+    for run in data().train.runs.iter().chain(&oscillators(5, 1000).runs) {
+        let columns: Vec<&[f64]> = run.columns[..2].iter().map(Vec::as_slice).collect();
+        assert_eq!(
+            predictor.predict_series(&columns).columns,
+            unbounded.predict_series(&columns).columns
+        );
+    }
+    // The same sensors with their samples in disorder: in range, and like nothing that was trained on.
+    let mut wild = oscillators(1, 2000).runs.remove(0);
+    for column in &mut wild.columns[..2] {
+        let count = column.len();
+        *column = (0..count).map(|k| column[k * 37 % count]).collect();
+    }
+    let columns: Vec<&[f64]> = wild.columns[..2].iter().map(Vec::as_slice).collect();
+    let (bounded, unbounded) = (
+        predictor.predict_series(&columns),
+        unbounded.predict_series(&columns),
+    );
+    let mut changed = 0;
+    for (k, (&b, &u)) in bounded.columns[0].iter().zip(&unbounded.columns[0]).enumerate() {
+        assert!(b >= guard.min[0] && b <= guard.max[0]);
+        if b.to_bits() != u.to_bits() {
+            changed += 1;
+            assert!(!bounded.inside[k], "a limited estimate is outside the envelope");
+        }
+    }
+    assert!(changed > 0, "the test should leave the training region");
 }
 
 #[test]

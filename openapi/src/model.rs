@@ -38,6 +38,9 @@ pub struct ModelConfig {
     /// the model: far outside its training data a polynomial says nothing, and says it loudly. Absent: not held.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub input_limits: Vec<[f64; 2]>,
+    /// Bounds of the estimates; absent in models of earlier versions, whose estimates are not bounded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub guard: Option<Guard>,
     /// Layers of the network (`net.*`), first to last; empty when the skip is the whole model.
     pub layers: Vec<DenseLayer>,
     /// Where the model comes from.
@@ -89,6 +92,27 @@ pub struct Schedule {
     pub half_range: Vec<f64>,
     /// One row per term: the exponent of each signal.
     pub exponents: Vec<Vec<u32>>,
+}
+
+/// Bounds of the estimates, one value per target, in its column's unit:
+///
+/// ```text
+/// guide = guard.weight · scaled window + guard.bias        (unscaled; tensors of `model.safetensors`)
+/// estimate = clamp(clamp(model, guide − slack, guide + slack), min, max)
+/// ```
+///
+/// The guide is a linear map with small coefficients, which cannot be far off when the window is unlike all training
+/// windows; the model's large coefficients can. On the training runs no estimate is changed. Where one is, the window is
+/// outside the envelope.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Guard {
+    /// Largest distance of an estimate from the guide.
+    pub slack: Vec<f64>,
+    /// Smallest estimate.
+    pub min: Vec<f64>,
+    /// Largest estimate.
+    pub max: Vec<f64>,
 }
 
 /// `output = activation(weight · input + bias)`.

@@ -12,7 +12,7 @@ use crate::train::prepare::{Part, Problem, TrainingData};
 use crate::window::{Series, Windows};
 use hydroflex_openapi::job::WindowCut;
 use hydroflex_openapi::model::{
-    DenseLayer, Envelope, EnvelopeGroup, GoldenPrediction, MODEL_FORMAT_VERSION, ModelConfig,
+    DenseLayer, Envelope, EnvelopeGroup, GoldenPrediction, Guard, MODEL_FORMAT_VERSION, ModelConfig,
     ModelProvenance, ModelSummary, TargetMetrics,
 };
 use sha2::{Digest, Sha256};
@@ -36,6 +36,11 @@ const ENVELOPE_ROOM: f64 = 1.5;
 /// Room around the training range of each input, relative to it: as far as our network follows.
 const ENVELOPE_MARGIN: f64 = 0.5 * (RANGE_FACTOR - 1.0);
 
+/// Room around the largest distance between estimate, or target, and guide on the training and validation runs …
+const GUARD_ROOM: f64 = 1.5;
+/// … and around the range of the targets, relative to it.
+const GUARD_MARGIN: f64 = 0.5;
+
 /// Assembles the model and writes its folder, replacing what is there.
 ///
 /// # Errors
@@ -55,6 +60,11 @@ pub fn write_model(
     };
     let mut config = config(problem, outcome, data);
     config.envelope = Some(envelope);
+    config.guard = Some(guard(
+        problem,
+        data,
+        &Predictor::new(&config, &weights, &auxiliary),
+    ));
     let predictor = Predictor::new(&config, &weights, &auxiliary);
     let judged = judge(problem, data, &predictor);
     config.validation = judged.network;
@@ -200,6 +210,57 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
     Weights {
         layers,
         skip: problem.skip.as_ref().map(SkipWeights::from),
+        guard: Some(LinearWeights::from(&problem.guide)),
+    }
+}
+
+/// Bounds that nothing in the training or validation runs touches: neither the targets nor the estimates of
+/// `unlimited`, the model without bounds.
+fn guard(problem: &Problem, data: &TrainingData, unlimited: &Predictor) -> Guard {
+    let scaling = &problem.target_scaling;
+    let targets = problem.spec.targets.len();
+    let mut distance = vec![0.0_f64; targets];
+    let (mut low, mut high) = (vec![f64::INFINITY; targets], vec![f64::NEG_INFINITY; targets]);
+    let mut guide = vec![0.0; targets];
+    let mut workspace = unlimited.workspace();
+    for (part, runs) in [
+        (&problem.train, &data.train),
+        (&problem.validation, &data.validation),
+    ] {
+        let positions = runs.positions(&problem.spec.inputs).unwrap_or_default();
+        let every = Windows::new(&part.series.run_rows, problem.steps, WindowCut::Overlapping);
+        let mut index = 0;
+        for run in &runs.runs {
+            let columns: Vec<&[f64]> = positions.iter().map(|&p| run.columns[p].as_slice()).collect();
+            let estimates = unlimited.predict_series_with(&columns, &mut workspace).columns;
+            for k in 0..estimates[0].len() {
+                let first = every.first_row(index);
+                index += 1;
+                problem
+                    .guide
+                    .apply(part.series.window(first, problem.steps), &mut guide);
+                let truth = part.targets.row(first + problem.steps - 1);
+                for t in 0..targets {
+                    let estimate = scaling.scale(t, estimates[t][k]);
+                    let off = (estimate - guide[t]).abs().max((truth[t] - guide[t]).abs());
+                    distance[t] = distance[t].max(off);
+                    low[t] = low[t].min(estimate).min(truth[t]);
+                    high[t] = high[t].max(estimate).max(truth[t]);
+                }
+            }
+        }
+    }
+    let channels = scaling.channels();
+    Guard {
+        slack: (0..targets)
+            .map(|t| GUARD_ROOM * distance[t] * channels[t].scale)
+            .collect(),
+        min: (0..targets)
+            .map(|t| scaling.unscale(t, low[t] - GUARD_MARGIN * (high[t] - low[t])))
+            .collect(),
+        max: (0..targets)
+            .map(|t| scaling.unscale(t, high[t] + GUARD_MARGIN * (high[t] - low[t])))
+            .collect(),
     }
 }
 
@@ -436,6 +497,7 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         linear_skip: problem.structure.linear_skip,
         input_limits: problem.input_limits.clone(),
         schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),
+        guard: None,
         layers: final_layers(problem),
         provenance: ModelProvenance {
             spec: problem.spec.clone(),

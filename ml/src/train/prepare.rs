@@ -36,6 +36,10 @@ const WHITENING_CUT: f64 = 1e-9;
 /// hold only rounding are not blown up to unit size.
 const WHITENING_FLOOR: f64 = 1e-8;
 
+/// The guide is the linear map that would be best if every sample had an independent error of this part of its
+/// channel's standard deviation: exact enough to be a bound, and too tame to explode on signals unlike the training's.
+const GUIDE_NOISE: f64 = 0.01;
+
 /// Runs to learn from, with all the channels of their data set.
 #[derive(Debug, Clone)]
 pub struct TrainingData {
@@ -105,6 +109,8 @@ pub struct Problem {
     pub linear: LinearMap,
     /// The same with coefficients that follow the pose: the skip connection of our network.
     pub skip: Option<ScheduledMap>,
+    /// A linear map with small coefficients, near which estimates are kept.
+    pub guide: LinearMap,
     /// What is minimised.
     pub loss: Loss,
     /// Values at which inputs are held, in their columns' units; none for the paper's structures.
@@ -214,6 +220,16 @@ impl Problem {
         let judge = WindowMoments::gather(&validation.series, &validation.windows, &validation.targets);
         let spectrum = Spectrum::new(&moments)?;
         let linear = spectrum.best_map(&moments, &judge);
+        let guide = spectrum.ridge_map(
+            &moments,
+            GUIDE_NOISE * GUIDE_NOISE
+                / spectrum
+                    .values
+                    .last()
+                    .copied()
+                    .unwrap_or(1.0)
+                    .max(f64::MIN_POSITIVE),
+        );
         let skip = if structure.linear_skip {
             Some(ScheduledMap::fit(
                 sample(&train, &every),
@@ -256,6 +272,7 @@ impl Problem {
             spectrum,
             linear,
             skip,
+            guide,
             input_limits: if structure.linear_skip {
                 input_limits(&train_inputs)
             } else {
