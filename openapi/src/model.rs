@@ -157,6 +157,12 @@ pub struct ModelProvenance {
     pub train_runs: usize,
     /// Validation runs used.
     pub validation_runs: usize,
+    /// Windows on which intervals and envelope were calibrated: of runs without a flag that were not trained on.
+    #[serde(default)]
+    pub calibration_windows: usize,
+    /// Longest of these runs.
+    #[serde(default)]
+    pub calibration_s: f64,
     /// Training windows in an epoch.
     pub train_windows: usize,
     /// Epochs done.

@@ -5,6 +5,7 @@ use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
 use crate::predict::Predictor;
+use crate::runs::Runs;
 use crate::scheduled::RANGE_FACTOR;
 use crate::structure::parameter_count;
 use crate::train::Outcome;
@@ -12,8 +13,8 @@ use crate::train::prepare::{Part, Problem, TrainingData};
 use crate::window::{Series, Windows};
 use hydroflex_openapi::job::WindowCut;
 use hydroflex_openapi::model::{
-    DenseLayer, Envelope, EnvelopeGroup, GoldenPrediction, Guard, MODEL_FORMAT_VERSION, ModelConfig,
-    ModelProvenance, ModelSummary, TargetMetrics,
+    DenseLayer, Envelope, GoldenPrediction, Guard, MODEL_FORMAT_VERSION, ModelConfig, ModelProvenance,
+    ModelSummary, TargetMetrics,
 };
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
@@ -24,15 +25,6 @@ use std::path::Path;
 const GOLDEN_WINDOWS: usize = 3;
 /// Version of the tensor framework, as in the workspace's manifest.
 const BURN_VERSION: &str = "0.22.1";
-/// Directions of the envelope have at least this part of the largest variance: below, rounding of the
-/// scaled inputs to f32 would be seen.
-const ENVELOPE_CUT: f64 = 1e-12;
-/// Variances within a group differ by at most this many powers of ten.
-const ENVELOPE_DECADES: f64 = 2.0;
-/// Part of the validation windows within each group's limit, before the limit is widened …
-const ENVELOPE_QUANTILE: f64 = 0.998;
-/// … by this factor, for what a few runs did not show.
-const ENVELOPE_ROOM: f64 = 1.5;
 /// Room around the training range of each input, relative to it: as far as our network follows.
 const ENVELOPE_MARGIN: f64 = 0.5 * (RANGE_FACTOR - 1.0);
 
@@ -52,7 +44,8 @@ pub fn write_model(
     out_dir: &Path,
 ) -> Result<ModelSummary, ModelError> {
     let weights = fold(problem, &outcome.parameters);
-    let (envelope, projection) = envelope(problem, data);
+    let (mut envelope, projection) = envelope(problem);
+    set_limits(&mut envelope, problem, &projection);
     let auxiliary = Auxiliary {
         least_squares: LinearWeights::from(&problem.linear),
         quasi_static: quasi_static(problem),
@@ -60,20 +53,13 @@ pub fn write_model(
     };
     let mut config = config(problem, outcome, data);
     config.envelope = Some(envelope);
-    config.guard = Some(guard(
-        problem,
-        data,
-        &Predictor::new(&config, &weights, &auxiliary),
-    ));
+    config.guard = Some(guard(problem, &Predictor::new(&config, &weights, &auxiliary)));
     let predictor = Predictor::new(&config, &weights, &auxiliary);
-    let judged = judge(problem, data, &predictor);
+    let judged = judge(problem, &predictor);
     config.validation = judged.network;
     config.validation_least_squares = judged.least_squares;
     config.intervals = judged.intervals;
-    if let Some(envelope) = &mut config.envelope {
-        set_limits(&mut envelope.groups, problem, &auxiliary);
-    }
-    config.golden = golden(problem, data, &predictor);
+    config.golden = golden(problem, &predictor);
     write_parts(&config, &weights, &auxiliary, out_dir)?;
     let model = Model::load(out_dir)?;
     Ok(summary(&model, problem, outcome))
@@ -216,7 +202,7 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
 
 /// Bounds that nothing in the training or validation runs touches: neither the targets nor the estimates of
 /// `unlimited`, the model without bounds.
-fn guard(problem: &Problem, data: &TrainingData, unlimited: &Predictor) -> Guard {
+fn guard(problem: &Problem, unlimited: &Predictor) -> Guard {
     let scaling = &problem.target_scaling;
     let targets = problem.spec.targets.len();
     let mut distance = vec![0.0_f64; targets];
@@ -224,14 +210,13 @@ fn guard(problem: &Problem, data: &TrainingData, unlimited: &Predictor) -> Guard
     let mut guide = vec![0.0; targets];
     let mut workspace = unlimited.workspace();
     for (part, runs) in [
-        (&problem.train, &data.train),
-        (&problem.validation, &data.validation),
+        (&problem.train, &problem.seen),
+        (&problem.validation, &problem.validation_inputs),
     ] {
-        let positions = runs.positions(&problem.spec.inputs).unwrap_or_default();
         let every = Windows::new(&part.series.run_rows, problem.steps, WindowCut::Overlapping);
         let mut index = 0;
         for run in &runs.runs {
-            let columns: Vec<&[f64]> = positions.iter().map(|&p| run.columns[p].as_slice()).collect();
+            let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
             let estimates = unlimited.predict_series_with(&columns, &mut workspace).columns;
             for k in 0..estimates[0].len() {
                 let first = every.first_row(index);
@@ -306,43 +291,30 @@ fn quasi_static(problem: &Problem) -> LinearWeights {
     }
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights) {
-    let rows = problem.spectrum.whitening(ENVELOPE_CUT, 0.0);
-    let bias = rows
-        .iter()
-        .map(|row| {
-            -row.iter()
-                .zip(&problem.moments.mean)
-                .map(|(p, m)| p * m)
-                .sum::<f64>() as f32
-        })
-        .collect();
-    let projection = LinearWeights {
-        weight: rows.iter().flatten().map(|&v| v as f32).collect(),
-        bias,
-    };
-    let positions = data.train.positions(&problem.spec.inputs).unwrap_or_default();
-    let (mut min, mut max) = (Vec::new(), Vec::new());
-    for position in positions {
+/// Envelope without limits, and its projection.
+fn envelope(problem: &Problem) -> (Envelope, LinearWeights) {
+    let (projection, groups) =
+        crate::envelope::projection(&problem.moments, &problem.spectrum, problem.spec.inputs.len());
+    let range = |input: usize| {
         let values = || {
-            data.train
+            problem
+                .seen
                 .runs
                 .iter()
-                .flat_map(move |run| run.columns[position].iter().copied())
+                .flat_map(move |run| run.columns[input].iter().copied())
         };
         let (low, high) = (
             values().fold(f64::INFINITY, f64::min),
             values().fold(f64::NEG_INFINITY, f64::max),
         );
         let margin = ENVELOPE_MARGIN * (high - low);
-        min.push(low - margin);
-        max.push(high + margin);
-    }
+        (low - margin, high + margin)
+    };
+    let (min, max) = (0..problem.spec.inputs.len()).map(range).unzip();
     (
         Envelope {
-            components: rows.len(),
-            groups: groups(&problem.spectrum.values, rows.len()),
+            components: projection.bias.len(),
+            groups,
             min,
             max,
         },
@@ -350,47 +322,19 @@ fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights)
     )
 }
 
-/// The first `count` directions, largest variance first, in groups of similar variance; no limits yet.
-fn groups(ascending: &[f64], count: usize) -> Vec<EnvelopeGroup> {
-    let largest = ascending.last().copied().unwrap_or(1.0);
-    let mut groups: Vec<EnvelopeGroup> = Vec::new();
-    let mut edge = f64::INFINITY;
-    for value in ascending.iter().rev().take(count) {
-        let decade = (value / largest).log10();
-        match groups.last_mut() {
-            Some(group) if decade > edge => group.components += 1,
-            _ => {
-                edge = decade - ENVELOPE_DECADES;
-                groups.push(EnvelopeGroup {
-                    components: 1,
-                    limit: f64::MAX,
-                });
-            }
-        }
-    }
-    groups
-}
-
-/// Limits that all but rare validation windows keep.
-fn set_limits(groups: &mut [EnvelopeGroup], problem: &Problem, auxiliary: &Auxiliary) {
-    let Some(map) = &auxiliary.envelope else { return };
-    let projection = crate::predict::kernel::PackedLayer::new(map, &[]);
-    let part = &problem.validation;
-    let mut out = vec![0.0; projection.padded()];
-    let mut squares = vec![Vec::with_capacity(part.windows.len()); groups.len()];
-    for index in 0..part.windows.len() {
-        let window = part.series.window(part.windows.first_row(index), problem.steps);
-        projection.forward(window, window.len(), 1, &mut out);
-        for (all, square) in squares
-            .iter_mut()
-            .zip(crate::predict::group_squares(groups, &out))
-        {
-            all.push(square);
-        }
-    }
-    for (group, squares) in groups.iter_mut().zip(&mut squares) {
-        group.limit = ENVELOPE_ROOM * evaluate::metrics::quantile(squares, ENVELOPE_QUANTILE);
-    }
+/// Limits of the envelope from the calibration runs.
+fn set_limits(envelope: &mut Envelope, problem: &Problem, projection: &LinearWeights) {
+    let honest: Vec<(Series, Windows)> = problem
+        .calibration
+        .iter()
+        .map(|(inputs, _)| {
+            let series = Series::new(inputs, &problem.input_scaling);
+            let windows = Windows::new(&series.run_rows, problem.steps, WindowCut::Overlapping);
+            (series, windows)
+        })
+        .collect();
+    let honest: Vec<(&Series, &Windows)> = honest.iter().map(|(s, w)| (s, w)).collect();
+    crate::envelope::set_limits(&mut envelope.groups, projection, &honest);
 }
 
 struct Judged {
@@ -400,7 +344,7 @@ struct Judged {
 }
 
 /// Errors on the validation runs, of the network as it will predict and of least squares.
-fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judged {
+fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
     let part = &problem.validation;
     let targets = problem.spec.targets.len();
     let scaling = &problem.target_scaling;
@@ -417,19 +361,7 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
             linear[t].push(scaling.unscale(t, row[t]));
         }
     }
-    let mut estimates = vec![Vec::new(); targets];
-    let positions = data
-        .validation
-        .positions(&problem.spec.inputs)
-        .unwrap_or_default();
-    let mut workspace = predictor.workspace();
-    for run in &data.validation.runs {
-        let columns: Vec<&[f64]> = positions.iter().map(|&p| run.columns[p].as_slice()).collect();
-        let series = predictor.predict_series_with(&columns, &mut workspace);
-        for (all, column) in estimates.iter_mut().zip(series.columns) {
-            all.extend(column);
-        }
-    }
+    let estimates = estimates(&problem.validation_inputs, predictor);
     let judge = |estimate: &[Vec<f64>]| -> Vec<TargetMetrics> {
         scaling
             .channels()
@@ -440,9 +372,20 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
             })
             .collect()
     };
-    let intervals = estimates
+    let (mut estimated, mut truth) = (vec![Vec::new(); targets], vec![Vec::new(); targets]);
+    for (inputs, wanted) in &problem.calibration {
+        for (all, part) in estimated.iter_mut().zip(self::estimates(inputs, predictor)) {
+            all.extend(part);
+        }
+        for run in &wanted.runs {
+            for (all, column) in truth.iter_mut().zip(&run.columns) {
+                all.extend(column.iter().skip(problem.steps - 1));
+            }
+        }
+    }
+    let intervals = estimated
         .iter()
-        .zip(&reference)
+        .zip(&truth)
         .zip(scaling.channels())
         .filter_map(|((e, r), channel)| evaluate::intervals::fit(e, r, channel.offset))
         .collect::<Vec<_>>();
@@ -457,14 +400,24 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
     }
 }
 
+/// Estimates at the ends of all windows of some runs, run after run, one column per target.
+fn estimates(inputs: &Runs, predictor: &Predictor) -> Vec<Vec<f64>> {
+    let mut estimates = vec![Vec::new(); predictor.target_count()];
+    let mut workspace = predictor.workspace();
+    for run in &inputs.runs {
+        let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
+        let series = predictor.predict_series_with(&columns, &mut workspace);
+        for (all, column) in estimates.iter_mut().zip(series.columns) {
+            all.extend(column);
+        }
+    }
+    estimates
+}
+
 /// Windows spread over the validation runs.
-fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<GoldenPrediction> {
-    let positions = data
-        .validation
-        .positions(&problem.spec.inputs)
-        .unwrap_or_default();
-    let long: Vec<_> = data
-        .validation
+fn golden(problem: &Problem, predictor: &Predictor) -> Vec<GoldenPrediction> {
+    let long: Vec<_> = problem
+        .validation_inputs
         .runs
         .iter()
         .filter(|run| run.len() >= problem.steps)
@@ -475,7 +428,7 @@ fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<
             let run = long.get(i * long.len() / GOLDEN_WINDOWS)?;
             let first = (run.len() - problem.steps) * (i + 1) / (GOLDEN_WINDOWS + 1);
             let window: Vec<f64> = (first..first + problem.steps)
-                .flat_map(|row| positions.iter().map(move |&p| run.columns[p][row]))
+                .flat_map(|row| run.columns.iter().map(move |column| column[row]))
                 .collect();
             let mut estimates = vec![0.0; predictor.target_count()];
             predictor.predict_window(&window, &mut estimates, &mut workspace);
@@ -486,6 +439,11 @@ fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<
 
 fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelConfig {
     let sample_time_s = data.train.sample_time_s;
+    let calibrating: Vec<usize> = problem
+        .calibration
+        .iter()
+        .flat_map(|(inputs, _)| inputs.runs.iter().map(crate::runs::RunSamples::len))
+        .collect();
     ModelConfig {
         format_version: MODEL_FORMAT_VERSION,
         structure: problem.structure.name.clone(),
@@ -504,6 +462,14 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
             dataset_sha256: data.dataset_sha256.clone(),
             train_runs: data.train.runs.len(),
             validation_runs: data.validation.runs.len(),
+            calibration_windows: calibrating
+                .iter()
+                .map(|steps| (steps + 1).saturating_sub(problem.steps))
+                .sum(),
+            calibration_s: calibrating
+                .iter()
+                .max()
+                .map_or(0.0, |&steps| steps as f64 * sample_time_s),
             train_windows: problem.train.windows.len(),
             epochs: outcome.epochs,
             best_epoch: outcome.best_epoch,
