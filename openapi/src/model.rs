@@ -241,6 +241,12 @@ pub struct TargetMetrics {
     /// Part of the samples inside the 90 % interval, where the model has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub coverage: Option<f64>,
+    /// The same in thirds of the samples by the size of the reference: its distance from the target's training mean.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub coverage_thirds: Option<[f64; 3]>,
+    /// Mean width of the intervals.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub interval_width: Option<f64>,
 }
 
 /// 90 % intervals by conformal prediction, in classes of the estimate's distance from the target's
@@ -352,4 +358,19 @@ pub struct BaselineMetrics {
     pub name: String,
     /// One per target.
     pub targets: Vec<TargetMetrics>,
+}
+
+/// How often the envelope flags a fault of the sensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FaultRate {
+    /// What is wrong.
+    pub fault: String,
+    /// Windows in which it can be known.
+    pub windows: u64,
+    /// Part of them that are flagged.
+    pub flagged: f64,
+    /// Cases with such windows.
+    pub cases: u64,
+    /// Part of them with a flag.
+    pub found: f64,
 }

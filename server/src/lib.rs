@@ -1,5 +1,6 @@
 //! The hydroflex service: coordinator, REST interface, predictions, and the command line around them.
 
+pub mod calibration;
 pub mod http;
 pub mod coordinator;
 pub mod prediction;
