@@ -2,10 +2,11 @@
 //!
 //! ```text
 //! x̃_k = x_k + σ n_k,                      n white, normal
-//! ṽ_k = v_k + σ_length (n_k − n_{k−1}) / h      velocity differentiated from the noisy length of its cylinder
+//! ṽ_k = (s̃_k − s̃_{k−1}) / h                 velocity differentiated from the noisy length of its cylinder
 //! ```
 //!
-//! n of a length and of its velocity are the same numbers. The covariance of a window's noise follows in closed form
+//! The velocity is the difference itself, not the true velocity with its noise: the two together with the noisy length
+//! would give away the true length without noise. Only where the length is no input, the true velocity is taken. The covariance of a window's noise follows in closed form
 //! and is added to that of the clean windows, so that least squares is exact for infinitely many noisy copies.
 
 use crate::runs::Runs;
@@ -108,7 +109,7 @@ impl Noise {
     /// When the runs have another number of columns.
     #[must_use]
     pub fn add(&self, runs: &Runs, seed: u64, stream: u64) -> Runs {
-        let mut noisy = runs.clone();
+        let mut noisy = self.differentiated(runs);
         let mut rng = ChaCha12Rng::seed_from_u64(seed);
         rng.set_stream(stream);
         for run in &mut noisy.runs {
@@ -130,6 +131,7 @@ impl Noise {
                             Source::Input(of) => &white[of],
                             Source::Own => &white[input],
                         };
+                        // The columns hold the clean difference.
                         for (value, pair) in column.iter_mut().zip(n.windows(2)) {
                             *value += std * (pair[1] - pair[0]) / self.sample_time_s;
                         }
@@ -138,6 +140,37 @@ impl Noise {
             }
         }
         noisy
+    }
+
+    /// `runs` without noise, but with velocities differentiated from lengths where the noise model does that; the first
+    /// sample's is that of the second.
+    ///
+    /// # Panics
+    /// When the runs have another number of columns.
+    #[must_use]
+    pub fn differentiated(&self, runs: &Runs) -> Runs {
+        let mut clean = runs.clone();
+        for run in &mut clean.runs {
+            assert_eq!(run.columns.len(), self.inputs.len(), "one column per input");
+            for (input, noise) in self.inputs.iter().enumerate() {
+                let InputNoise::Differentiated {
+                    source: Source::Input(of),
+                    ..
+                } = *noise
+                else {
+                    continue;
+                };
+                let length = run.columns[of].clone();
+                let velocity = &mut run.columns[input];
+                for k in 1..length.len() {
+                    velocity[k] = (length[k] - length[k - 1]) / self.sample_time_s;
+                }
+                if length.len() > 1 {
+                    velocity[0] = velocity[1];
+                }
+            }
+        }
+        clean
     }
 
     /// Covariance of the noise of a scaled window of `steps` samples, whole matrix.
@@ -285,6 +318,23 @@ mod tests {
         let length = &noisy.runs[0].columns[1];
         let velocity = &noisy.runs[0].columns[2];
         assert!(((length[7] - length[6]) / 0.005 - velocity[7]).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_differentiated_velocity_tells_no_more_than_the_noisy_length() {
+        let mut runs = quiet(&["length_lift_m", "velocity_lift_m_per_s"], 50);
+        for k in 0..50_u32 {
+            let t = f64::from(k) * 0.005;
+            runs.runs[0].columns[0][k as usize] = (9.0 * t).sin();
+            runs.runs[0].columns[1][k as usize] = 9.0 * (9.0 * t).cos();
+        }
+        let noise = Noise::new(&NoiseSpec::Level(NoiseLevel::Crane), &runs.channels, 0.005).unwrap();
+        let noisy = noise.add(&runs, 0, 0);
+        let [length, velocity] = [&noisy.runs[0].columns[0], &noisy.runs[0].columns[1]];
+        for k in 1..50 {
+            // Rounding of a difference of numbers of size one, over the sample time.
+            assert!(((length[k] - length[k - 1]) / 0.005 - velocity[k]).abs() < 1e-12);
+        }
     }
 
     #[test]

@@ -5,13 +5,14 @@
 
 #![allow(clippy::unwrap_used, reason = "tests")]
 
+use hydroflex_ml::evaluate;
 use hydroflex_ml::model::Model;
 use hydroflex_ml::predict::Predictor;
 use hydroflex_ml::runs::{RunSamples, Runs};
 use hydroflex_ml::train::prepare::TrainingData;
 use hydroflex_ml::train::{Progress, TrainError, train};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
-use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
+use hydroflex_openapi::job::{NoiseSpec, TrainingSpec, WindowCut, WindowRule};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -205,6 +206,66 @@ fn bounds_leave_known_signals_alone_and_hold_unknown_ones() {
     let changed = |k: &usize| free.columns[0][*k].to_bits() != limited.columns[0][*k].to_bits();
     assert!((0..free.inside.len()).filter(changed).all(|k| !limited.inside[k]));
     assert!((0..free.inside.len()).filter(changed).count() > free.inside.len() / 2);
+}
+
+#[test]
+fn a_network_trained_for_noise_is_better_under_noise_and_resumes_to_the_same_bytes() {
+    let folder = Folder::new("noise");
+    let stds = [
+        ("valve_lift_ratio".to_owned(), 0.05),
+        ("length_lift_m".to_owned(), 2e-3),
+    ];
+    let noise = NoiseSpec::Channels(stds.into());
+    let trained_for = TrainingSpec {
+        noise: Some(noise),
+        ..spec("best", 60)
+    };
+    run(&spec("best", 60), &folder.0, "clean").unwrap();
+    run(&trained_for, &folder.0, "noisy").unwrap();
+    let [clean, noisy] = ["clean", "noisy"].map(|name| Model::load(&folder.0.join(name)).unwrap());
+    let unseen = evaluate::with_noise_of_training(&noisy, &oscillators(10, 1000), 1).unwrap();
+    let mae = |model| evaluate::evaluate(model, &unseen, "").unwrap().report.targets[0].mae;
+    assert!(
+        mae(&noisy) < 0.7 * mae(&clean),
+        "{:e} {:e}",
+        mae(&noisy),
+        mae(&clean)
+    );
+    let report = evaluate::evaluate(&noisy, &unseen, "").unwrap().report;
+    // Four runs calibrate and ten judge: a coarse check that noise is in the intervals.
+    assert!(
+        (0.8..0.97).contains(&report.targets[0].coverage.unwrap()),
+        "{report:?}"
+    );
+    let mut stop = |progress: Progress| {
+        if progress.epoch >= 20 {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
+    };
+    let checkpoint = folder.0.join("checkpoint");
+    train(
+        &data(),
+        &trained_for,
+        &mut stop,
+        &checkpoint,
+        &folder.0.join("resumed"),
+    )
+    .unwrap_err();
+    run(&trained_for, &folder.0, "resumed").unwrap();
+    assert_eq!(folder.files("noisy"), folder.files("resumed"));
+    let wrong = TrainingSpec {
+        noise: Some(NoiseSpec::Channels(
+            [("deflection_tip_y_m".to_owned(), 1.0)].into(),
+        )),
+        ..spec("best", 1)
+    };
+    let error = run(&wrong, &folder.0, "wrong").unwrap_err().to_string();
+    assert!(
+        error.contains("deflection_tip_y_m") && error.contains("no input"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -188,6 +188,7 @@ impl Problem {
     ///
     /// # Errors
     /// The data cannot answer the specification.
+    #[allow(clippy::too_many_lines, reason = "one check after the other")]
     pub fn new(data: &TrainingData, spec: &TrainingSpec) -> Result<Self, TrainError> {
         let spec = with_defaults(data, spec);
         check_names(&spec)?;
@@ -212,6 +213,10 @@ impl Problem {
             noise
                 .as_ref()
                 .map_or_else(|| runs.clone(), |noise| noise.add(runs, spec.seed, stream))
+        };
+        let train_inputs = match &noise {
+            Some(noise) => noise.differentiated(&train_inputs),
+            None => train_inputs,
         };
         let seen = noisy(&train_inputs, SEEN_STREAM);
         let validation_inputs = noisy(&validation_inputs, SEEN_STREAM + 1);
