@@ -6,11 +6,13 @@
 
 pub mod kernel;
 pub mod skip;
+pub mod guard;
 pub mod sliding;
 pub mod synthetic;
 
 use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
+use guard::GuardKernel;
 use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelConfig};
 use kernel::PackedLayer;
 use skip::SkipKernel;
@@ -31,6 +33,7 @@ pub struct Predictor {
     /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
     skip: Option<SkipKernel>,
+    guard: Option<GuardKernel>,
     intervals: Vec<IntervalTable>,
     envelope: Option<EnvelopeKernel>,
 }
@@ -51,6 +54,9 @@ pub struct Workspace {
     ping: Vec<f32>,
     pong: Vec<f32>,
     skip: Vec<f64>,
+    guide: Vec<f32>,
+    /// Whether the guard changed an estimate of each window of the last block.
+    limited: Vec<bool>,
     projected: Vec<f32>,
 }
 
@@ -150,6 +156,11 @@ impl Predictor {
                 config.targets.len(),
             )
         });
+        let guard = config
+            .guard
+            .as_ref()
+            .zip(weights.guard.as_ref())
+            .map(|(guard, guide)| GuardKernel::new(guide, guard, &config.targets));
         let envelope = config
             .envelope
             .as_ref()
@@ -172,6 +183,7 @@ impl Predictor {
             limits: scaled_limits(config),
             layers,
             skip,
+            guard,
             intervals: config.intervals.clone(),
             envelope,
         }
@@ -223,6 +235,8 @@ impl Predictor {
             ping: vec![0.0; BLOCK_ROWS * widest],
             pong: vec![0.0; BLOCK_ROWS * widest],
             skip: vec![0.0; BLOCK_ROWS * self.skip.as_ref().map_or(0, SkipKernel::padded)],
+            guide: vec![0.0; BLOCK_ROWS * self.guard.as_ref().map_or(0, GuardKernel::padded)],
+            limited: vec![false; BLOCK_ROWS],
             projected: vec![
                 0.0;
                 self.envelope
@@ -400,6 +414,8 @@ impl Predictor {
             ping,
             pong,
             skip,
+            guide,
+            limited,
             ..
         } = workspace;
         let scaled = &mut scaled[..rows * targets];
@@ -421,9 +437,13 @@ impl Predictor {
         if let Some(kernel) = &self.skip {
             kernel.add(x, stride, rows, skip, scaled);
         }
+        if let Some(kernel) = &self.guard {
+            kernel.limit(x, stride, rows, guide, scaled, limited);
+        }
     }
 
-    /// Whether each of the windows is near the training windows; ranges are not looked at.
+    /// Whether each of the windows that [`Self::block`] estimated last is near the training windows: inside the
+    /// envelope, and its estimate not limited. Ranges are not looked at.
     fn inside_block(
         &self,
         x: &[f32],
@@ -445,6 +465,9 @@ impl Predictor {
             *flag = group_squares(&envelope.groups, row)
                 .zip(&envelope.groups)
                 .all(|(square, group)| square <= group.limit);
+        }
+        for (flag, limited) in inside.iter_mut().zip(&workspace.limited) {
+            *flag &= !limited;
         }
     }
 
