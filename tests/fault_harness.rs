@@ -9,18 +9,26 @@
 //! `HYDROFLEX_FAULT_SEED` repeats the choices of a trial: which fault, on whom, when. What a fault meets
 //! still depends on the operating system's schedule.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 use anyhow::{Context, ensure};
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::transition::ShardState;
 use hydroflex_ledger::{Ledger, ShardKind};
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::status::{JobState, JobStatus};
+use hydroflex_tests::clock::{self, Clock};
+use hydroflex_tests::network::{Network, forward};
 use hydroflex_tests::proxy::{Mode, Proxy};
 use hydroflex_tests::servers::{moto, postgres::Postgres};
 use hydroflex_tests::{Pilot, ServiceUnderTest, Start, sha256, signal};
 use nix::sys::signal::Signal;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -33,6 +41,11 @@ const SHORT: usize = 40;
 const PER_TRIAL: usize = 14;
 
 const RUNS: u64 = 600;
+
+/// On PostgreSQL; SQLite is for one machine and one coordinator.
+const COORDINATORS: usize = 2;
+/// Workers that no coordinator supervises.
+const PILOTS: usize = 2;
 
 fn job() -> serde_json::Value {
     serde_json::json!({
@@ -81,6 +94,8 @@ enum Fault {
     StoreHangs,
     StoreCutOff,
     DiskFull,
+    NetworkCut,
+    ClockJump,
 }
 
 impl Fault {
@@ -96,6 +111,8 @@ impl Fault {
             Self::StoreHangs => "S3 does not answer",
             Self::StoreCutOff => "S3 connections cut",
             Self::DiskFull => "disk full",
+            Self::NetworkCut => "machine cut off the network, later joined again",
+            Self::ClockJump => "wall clock of a process jumps by up to a day",
         }
     }
 }
@@ -187,6 +204,11 @@ struct Trial {
     data: Vec<tempfile::TempDir>,
     cache: PathBuf,
     disk: Option<SmallDisk>,
+    /// Machines of their own for two coordinators and two pilots, in this order.
+    network: Option<Network>,
+    /// Their clocks, and the library by which they jump.
+    clocks: Vec<Clock>,
+    clock_library: Option<PathBuf>,
     database: String,
     store: String,
     environment: Vec<(&'static str, String)>,
@@ -197,6 +219,8 @@ struct Trial {
     pilots: Vec<Pilot>,
     /// Processes that are stopped, and when they go on.
     stopped: Vec<(u32, Instant)>,
+    /// Machines that are cut off, and when they join again.
+    cut: Vec<(usize, Instant)>,
     counts: BTreeMap<Fault, usize>,
 }
 
@@ -206,8 +230,22 @@ impl Trial {
         let disk = (setup == Setup::SqliteDirectory)
             .then(|| SmallDisk::mount(data[0].path()))
             .flatten();
+        let network = (setup == Setup::PostgresS3)
+            .then(|| Network::new(COORDINATORS + PILOTS))
+            .flatten();
+        let here = network.as_ref().map_or(Ipv4Addr::LOCALHOST, Network::here);
         let database = match &servers.postgres {
-            Some(postgres) if setup.has_postgres() => postgres.database(&format!("trial_{seed:016x}")),
+            Some(postgres) if setup.has_postgres() => {
+                let url = postgres.database(&format!("trial_{seed:016x}"));
+                let port = match network {
+                    Some(_) => forward(here, postgres.port(), None)?,
+                    None => postgres.port(),
+                };
+                url.replace(
+                    &format!("127.0.0.1:{}", postgres.port()),
+                    &format!("{here}:{port}"),
+                )
+            }
             _ => format!("sqlite:{}", data[0].path().join("ledger.sqlite").display()),
         };
         let mut environment = Vec::new();
@@ -216,19 +254,25 @@ impl Trial {
             Some(moto) if setup.has_s3() => {
                 let bucket = format!("trial-{seed:016x}");
                 moto.bucket(&bucket);
-                let between = Proxy::start(moto.port())?;
-                environment = moto::environment(between.port());
+                let between = Proxy::start_at(here, moto.port())?;
+                environment = moto::environment_at(&here.to_string(), between.port());
                 proxy = Some(between);
                 format!("s3://{bucket}/night")
             }
             _ => format!("file://{}", data[0].path().join("store").display()),
         };
+        let clocks = (0..COORDINATORS + PILOTS)
+            .map(|machine| Clock::new(data[1].path(), &machine.to_string()))
+            .collect::<Result<_, _>>()?;
         let mut trial = Self {
             setup,
             choices: Choices(seed),
             data,
             cache: cache.to_owned(),
             disk,
+            network,
+            clocks,
+            clock_library: clock::library(),
             database,
             store,
             environment,
@@ -237,23 +281,23 @@ impl Trial {
             armed: [false; 2],
             pilots: Vec::new(),
             stopped: Vec::new(),
+            cut: Vec::new(),
             counts: BTreeMap::new(),
         };
-        // SQLite is for one machine and one coordinator; PostgreSQL for several of both.
-        let coordinators = if setup.has_postgres() { 2 } else { 1 };
+        let coordinators = if setup.has_postgres() { COORDINATORS } else { 1 };
         for index in 0..coordinators {
             let service = trial.start_coordinator(index, None)?;
             trial.coordinators.push(Some(service));
         }
-        for _ in 0..2 {
-            let pilot = trial.start_pilot(None)?;
+        for index in 0..PILOTS {
+            let pilot = trial.start_pilot(index, None)?;
             trial.pilots.push(pilot);
         }
         Ok(trial)
     }
 
     fn start_coordinator(&self, index: usize, crash_at: Option<&str>) -> anyhow::Result<ServiceUnderTest> {
-        let mut environment = self.environment.clone();
+        let mut environment = self.environment_of(index);
         environment.push(("HYDROFLEX_LEASE", "3".to_owned()));
         environment.push(("HYDROFLEX_CACHE", self.cache.display().to_string()));
         if let Some(point) = crash_at {
@@ -266,16 +310,35 @@ impl Trial {
                 environment,
                 database: Some(self.database.clone()),
                 store: Some(self.store.clone()),
+                namespace: self.network.as_ref().map(|network| network.name(index)),
             },
         )
     }
 
-    fn start_pilot(&self, crash_at: Option<String>) -> anyhow::Result<Pilot> {
+    /// Variables of the processes on a machine: where the store is, and what time it is.
+    fn environment_of(&self, machine: usize) -> Vec<(&'static str, String)> {
         let mut environment = self.environment.clone();
+        if let Some(library) = &self.clock_library {
+            environment.extend(self.clocks[machine].environment(library));
+        }
+        environment
+    }
+
+    fn start_pilot(&self, index: usize, crash_at: Option<String>) -> anyhow::Result<Pilot> {
+        let machine = COORDINATORS + index;
+        let mut environment = self.environment_of(machine);
         if let Some(point) = crash_at {
             environment.push(("HYDROFLEX_CRASH_AT", point));
         }
-        Pilot::start(&self.database, &self.store, &self.cache, &environment, &[])
+        let namespace = self.network.as_ref().map(|network| network.name(machine));
+        Pilot::start_in(
+            namespace.as_deref(),
+            &self.database,
+            &self.store,
+            &self.cache,
+            &environment,
+            &[],
+        )
     }
 
     /// A coordinator that answers, started again if every one has died.
@@ -299,7 +362,7 @@ impl Trial {
                 return self.coordinators[index].as_ref().context("just found");
             }
             ensure!(
-                start.elapsed() < Duration::from_secs(120),
+                start.elapsed() < Duration::from_mins(2),
                 "no coordinator can be started any more"
             );
             std::thread::sleep(Duration::from_millis(200));
@@ -308,8 +371,8 @@ impl Trial {
 
     fn allowed(&self) -> Vec<Fault> {
         use Fault::{
-            CrashPoint, DiskFull, KillCoordinator, KillPostgres, KillWorker, StopCoordinator, StopWorker,
-            StoreCutOff, StoreFails, StoreHangs,
+            ClockJump, CrashPoint, DiskFull, KillCoordinator, KillPostgres, KillWorker, NetworkCut,
+            StopCoordinator, StopWorker, StoreCutOff, StoreFails, StoreHangs,
         };
         let mut faults = vec![
             KillWorker,
@@ -328,6 +391,12 @@ impl Trial {
         }
         if self.disk.is_some() {
             faults.push(DiskFull);
+        }
+        if self.network.is_some() {
+            faults.extend([NetworkCut, NetworkCut]);
+        }
+        if self.clock_library.is_some() {
+            faults.push(ClockJump);
         }
         faults
     }
@@ -388,6 +457,23 @@ impl Trial {
                 disk.empty();
                 true
             }
+            Fault::NetworkCut => {
+                let pause = self.choices.between(500, 9000);
+                let network = self.network.as_ref().context("only chosen where there is one")?;
+                let machine = self.choices.below(network.machines());
+                let is_cut = self.cut.iter().any(|(cut, _)| *cut == machine);
+                let happened = !is_cut && network.cut(machine);
+                if happened {
+                    self.cut.push((machine, Instant::now() + pause));
+                }
+                happened
+            }
+            Fault::ClockJump => {
+                let clock = self.choices.of(&self.clocks);
+                let minutes = i64::try_from(self.choices.below(2 * 24 * 60))? - 24 * 60;
+                clock.set_ahead(60 * minutes)?;
+                true
+            }
         };
         if happened {
             *self.counts.entry(fault).or_default() += 1;
@@ -437,7 +523,7 @@ impl Trial {
             return Ok(false);
         }
         let times = 1 + self.choices.below(3);
-        let mut pilot = self.start_pilot(Some(format!("{point}:{times}")))?;
+        let mut pilot = self.start_pilot(0, Some(format!("{point}:{times}")))?;
         let start = Instant::now();
         while pilot.is_running() {
             // Nothing left to do for it: then it does not die, and is no fault.
@@ -456,6 +542,15 @@ impl Trial {
             .into_iter()
             .partition(|(_, at)| everybody || *at <= now);
         self.stopped = later;
+        let (whole_again, still_cut) = std::mem::take(&mut self.cut)
+            .into_iter()
+            .partition(|(_, at)| everybody || *at <= now);
+        self.cut = still_cut;
+        let whole_again: Vec<(usize, Instant)> = whole_again;
+        for (machine, _) in whole_again {
+            let network = self.network.as_ref().context("only machines of one are cut")?;
+            ensure!(network.mend(machine), "machine {machine} cannot join again");
+        }
         let due: Vec<(u32, Instant)> = due;
         for (process, _) in due {
             // Killed meanwhile, by us or by its supervisor: there is nobody to continue.
@@ -463,7 +558,7 @@ impl Trial {
         }
         for index in 0..self.pilots.len() {
             if !self.pilots[index].is_running() {
-                self.pilots[index] = self.start_pilot(None)?;
+                self.pilots[index] = self.start_pilot(index, None)?;
             }
         }
         self.coordinator().map(drop)
@@ -471,7 +566,7 @@ impl Trial {
 
     /// A data set that anybody can see is whole, whenever one looks.
     fn look_as_a_reader(&mut self) -> anyhow::Result<()> {
-        if !self.stopped.is_empty() {
+        if !self.stopped.is_empty() || !self.cut.is_empty() {
             return Ok(());
         }
         let service = self.coordinator()?;
@@ -500,7 +595,7 @@ impl Trial {
 
     fn status(&mut self, id: &str) -> Option<JobStatus> {
         // One that is stopped would not answer for seconds.
-        if !self.stopped.is_empty() {
+        if !self.stopped.is_empty() || !self.cut.is_empty() {
             return None;
         }
         self.coordinator().ok()?.job(id).ok()
@@ -542,7 +637,7 @@ impl Trial {
             // One that was to die at its last step may do so just now.
             match self.coordinator()?.job(id) {
                 Ok(status) => break status,
-                Err(error) => ensure!(start.elapsed() < Duration::from_secs(60), "{error:#}"),
+                Err(error) => ensure!(start.elapsed() < Duration::from_mins(1), "{error:#}"),
             }
         };
         ensure!(
@@ -766,7 +861,9 @@ fn report(path: &Path, tally: &Tally, setups: &[Setup], seed: u64) -> std::io::R
          cargo test --release --workspace --test fault_harness -- --nocapture\n```\n\n{}\n\
          A worker or coordinator that is stopped is continued after 0.2 to 6 s; the lease is 3 s. S3 is `moto`\n\
          behind a proxy that answers 500, does not answer, or cuts connections. The disk is a tmpfs of 48 MB\n\
-         (SQLite and directory, as root). Not injected: clock jumps, cut networks between machines, power cuts.\n",
+         (SQLite and directory, as root). On PostgreSQL and S3 every coordinator and pilot has a network namespace of\n\
+         its own, whose cable is pulled for 0.5 to 9 s: packets vanish, nobody is told. A clock jump sets the wall\n\
+         clock of one process (by `libfaketime`), at most a day ahead or behind. Not injected: power cuts.\n",
         tally.total(),
         tally.table(setups)
     );

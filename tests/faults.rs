@@ -1,5 +1,10 @@
 //! Whatever dies on the way: a job ends with the same data set as if nothing had happened.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::status::{JobState, JobStatus};
 use hydroflex_tests::{Pilot, ServiceUnderTest, Start, servers, signal};
@@ -499,20 +504,19 @@ impl Shared {
     fn start(&self, workers: usize) -> Start {
         Start {
             workers,
-            environment: self.environment(),
+            environment: Self::environment(),
             database: Some(self.database.clone()),
             store: Some(self.store.clone()),
         }
     }
 
-    fn environment(&self) -> Vec<(&'static str, String)> {
+    fn environment() -> Vec<(&'static str, String)> {
         let server = servers::moto::shared().unwrap();
         servers::moto::environment(server.port())
     }
 
     fn objects(&self, below: &str) -> Vec<String> {
-        let variables = self
-            .environment()
+        let variables = Self::environment()
             .into_iter()
             .map(|(name, value)| (name.to_owned(), value));
         let blobs = Blobs::open_with(&self.store, variables).unwrap();
@@ -521,7 +525,14 @@ impl Shared {
     }
 
     fn pilot(&self, cache: &Path, arguments: &[&str]) -> Pilot {
-        Pilot::start(&self.database, &self.store, cache, &self.environment(), arguments).unwrap()
+        Pilot::start(
+            &self.database,
+            &self.store,
+            cache,
+            &Self::environment(),
+            arguments,
+        )
+        .unwrap()
     }
 }
 

@@ -2,6 +2,13 @@
 //!
 //! `HYDROFLEX_REFERENCE` names the folder with `liftboom/`; without it these tests pass and say so.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 use std::path::PathBuf;
 use std::sync::OnceLock;
 

@@ -45,9 +45,9 @@ pub fn training_data(
         let chosen = |index: &usize| index % VALIDATION_STRIDE == VALIDATION_STRIDE - 1;
         for (index, run) in runs.into_iter().enumerate() {
             if chosen(&index) {
-                validation.runs.push(run)
+                validation.runs.push(run);
             } else {
-                train.runs.push(run)
+                train.runs.push(run);
             }
         }
     }

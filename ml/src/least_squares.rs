@@ -20,7 +20,7 @@ use crate::window::{Series, Windows};
 use faer::diag::Diag;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};
-use faer::{Mat, Par};
+use faer::{Mat, Par, Spec};
 
 /// Scaled targets in f64, row by row as the [`Series`] they belong to.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,8 +90,9 @@ impl WindowMoments {
                 }
             }
         }
-        mean.iter_mut().for_each(|m| *m /= count);
-        target_mean.iter_mut().for_each(|m| *m /= count);
+        for mean in mean.iter_mut().chain(&mut target_mean) {
+            *mean /= count;
+        }
         for j in 0..size {
             for i in j..size {
                 second[(i, j)] = second[(i, j)] / count - mean[i] * mean[j];
@@ -278,14 +279,14 @@ impl Spectrum {
         let mut vectors = Mat::<f64>::zeros(size, size);
         let mut values = Diag::<f64>::zeros(size);
         let scratch =
-            self_adjoint_evd_scratch::<f64>(size, ComputeEigenvectors::Yes, Par::Seq, Default::default());
+            self_adjoint_evd_scratch::<f64>(size, ComputeEigenvectors::Yes, Par::Seq, Spec::default());
         self_adjoint_evd(
             moments.covariance.as_ref(),
             values.as_mut(),
             Some(vectors.as_mut()),
             Par::Seq,
             MemStack::new(&mut MemBuffer::new(scratch)),
-            Default::default(),
+            Spec::default(),
         )
         .map_err(|_| SpectrumError)?;
         Ok(Self {

@@ -16,6 +16,15 @@
 //! * [`model`]: the model folder; [`predict`]: estimates without the tensor framework.
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
 
+#![cfg_attr(
+    test,
+    allow(
+        clippy::cast_possible_truncation,
+        clippy::float_cmp,
+        reason = "small known numbers; equal means equal"
+    )
+)]
+
 pub mod runs;
 pub mod dataset;
 pub mod recording;

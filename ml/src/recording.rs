@@ -243,10 +243,13 @@ pub struct PredictedColumn {
     /// Column of the target.
     pub name: String,
     /// Estimates; absent before the first whole window.
-    pub values: Vec<Option<f64>>,
+    pub values: Estimates,
     /// Lower and upper ends of the 90 % intervals, where the model has them.
-    pub bounds: Option<(Vec<Option<f64>>, Vec<Option<f64>>)>,
+    pub bounds: Option<(Estimates, Estimates)>,
 }
+
+/// One number per row of a recording; absent before the first whole window.
+pub type Estimates = Vec<Option<f64>>;
 
 /// Estimates of a recording, one row per sample.
 #[derive(Debug, Clone, PartialEq, Default)]

@@ -26,10 +26,10 @@ use crate::least_squares::TargetRows;
 use crate::scaling::Scaling;
 use crate::window::{Series, Windows};
 use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt::factor::{cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{Accum, Mat, Par};
+use faer::{Accum, Mat, Par, Spec};
 use hydroflex_openapi::model::Schedule;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -228,11 +228,9 @@ fn terms(scheduling: usize, steps: usize, width: usize) -> Vec<Term> {
             continue;
         }
         let room = MAX_UNKNOWNS.saturating_sub(size + 1);
-        let product_steps = if products == 0 {
-            steps
-        } else {
-            ((room / products).saturating_sub(1) / width).min(steps)
-        };
+        let product_steps = room
+            .checked_div(products)
+            .map_or(steps, |share| (share.saturating_sub(1) / width).min(steps));
         if degree > 0 && product_steps < FEWEST_PRODUCT_STEPS.min(steps) {
             continue;
         }
@@ -368,13 +366,13 @@ impl<'a> Normal<'a> {
                 }
             }
         }
-        let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Default::default());
+        let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Spec::default());
         cholesky_in_place(
             matrix.as_mut(),
-            Default::default(),
+            LltRegularization::default(),
             Par::Seq,
             MemStack::new(&mut MemBuffer::new(scratch)),
-            Default::default(),
+            Spec::default(),
         )
         .ok()?;
         Some(matrix)
@@ -466,10 +464,10 @@ impl<'a> Normal<'a> {
                 let row = position * targets + t;
                 let weights = &mut weight[row * self.size..(row + 1) * self.size];
                 bias[row] = candidate.unknowns[(term.offset, t)];
-                for k in term.first..self.size {
-                    let value = candidate.unknowns[(term.offset + 1 + k - term.first, t)];
-                    weights[k] = value;
-                    bias[row] -= value * self.mean[k];
+                let inputs = weights[term.first..].iter_mut().zip(&self.mean[term.first..]);
+                for (k, (weight, mean)) in inputs.enumerate() {
+                    *weight = candidate.unknowns[(term.offset + 1 + k, t)];
+                    bias[row] -= *weight * mean;
                 }
             }
         }
@@ -513,7 +511,9 @@ fn mean_window(sample: &Sample<'_>, chosen: &[usize]) -> Vec<f64> {
             *m += f64::from(x);
         }
     }
-    mean.iter_mut().for_each(|m| *m /= chosen.len().max(1) as f64);
+    for mean in &mut mean {
+        *mean /= chosen.len().max(1) as f64;
+    }
     mean
 }
 

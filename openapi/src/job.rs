@@ -54,6 +54,17 @@ pub struct JobSpec {
     /// Sample type of the published files.
     #[serde(default)]
     pub sample_type: SampleType,
+    /// Columns of the samples that are kept, beside `run_id`, `step` and `time_s`; all if absent.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub columns: Vec<String>,
+    /// Size at which a file of samples ends and the next begins: what such a file takes on disk, about,
+    /// 1 to 4096 MB.
+    #[serde(
+        default = "default_file_size_mb",
+        skip_serializing_if = "is_default_file_size"
+    )]
+    #[schema(minimum = 1, maximum = 4096)]
+    pub file_size_mb: u32,
     /// Extra runs with the test signal, from which the SLIDE window follows; not counted in `runs`.
     #[serde(default = "default_settling_runs")]
     pub settling_runs: u64,
@@ -69,6 +80,15 @@ pub struct JobSpec {
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
 fn is_default_priority(priority: &i32) -> bool {
     *priority == 0
+}
+
+fn default_file_size_mb() -> u32 {
+    128
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_default_file_size(size: &u32) -> bool {
+    *size == default_file_size_mb()
 }
 
 fn default_machine() -> MachineRef {
@@ -90,6 +110,12 @@ fn default_settling_runs() -> u64 {
 impl JobSpec {
     /// Priorities that a job may have.
     pub const PRIORITIES: std::ops::RangeInclusive<i32> = -100..=100;
+
+    /// Whether the data set has this column of the simulator's.
+    #[must_use]
+    pub fn keeps(&self, channel: &str) -> bool {
+        self.columns.is_empty() || self.columns.iter().any(|name| name == channel)
+    }
 
     /// Steps of a run: its length in sample times, rounded. A run has one sample more.
     #[must_use]

@@ -4,6 +4,15 @@
 //! description (does the mesh exist, is the stiffness regular, can the loop close) is decided in
 //! `hydroflex-sim` and `hydroflex-ml`, which convert these types once, at the edge.
 
+#![cfg_attr(
+    test,
+    allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "small known numbers; equal means equal"
+    )
+)]
+
 pub mod machine;
 pub mod channel;
 pub mod job;

@@ -92,6 +92,10 @@ pub struct JobStatus {
     pub spec: JobSpec,
     /// SHA-256 of the machine (file, meshes, version of the reduction).
     pub machine_sha256: String,
+    /// Instruction-set level of the workers that simulate it, once the first one has begun: workers of
+    /// another level leave the job alone, because their numbers would differ in the last digits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub instruction_set: Option<String>,
     /// Runs.
     pub progress: Progress,
     /// The data set, once published.

@@ -1,4 +1,10 @@
 #![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    clippy::unwrap_used,
+    reason = "a benchmark prints, and stops at what it did not expect"
+)]
+#![allow(
     clippy::print_stdout,
     reason = "its output is read by the script that drives it"
 )]
@@ -123,14 +129,14 @@ fn kernel() -> anyhow::Result<()> {
             );
             std::hint::black_box(&out);
         }
-        let network = computed()? - begun;
+        let network = computed()?.checked_sub(begun).unwrap();
         let mut out = vec![0.0_f64; batch * targets];
         let begun = computed()?;
         for _ in 0..calls {
             predictor.predict_windows(std::hint::black_box(&windows), &mut out, &mut workspace);
             std::hint::black_box(&out);
         }
-        let whole = computed()? - begun;
+        let whole = computed()?.checked_sub(begun).unwrap();
         let us = |time: Duration| time.as_secs_f64() * 1e6 / f64::from(calls);
         println!("{} {}", us(network), us(whole));
         std::io::stdout().flush()?;

@@ -22,7 +22,7 @@ const KEY: &str = "HYDROFLEX_KEY";
 const POLL: Duration = Duration::from_millis(100);
 
 /// How long a service may be away (a restart) before following a job gives up.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A service at a base URL.
 #[derive(Debug, Clone)]
@@ -68,7 +68,6 @@ impl Client {
     }
 
     /// A GET request, for callers that need its headers.
-    #[must_use]
     pub fn request(&self, path: &str) -> RequestBuilder {
         self.http.get(self.url(path))
     }

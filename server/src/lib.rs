@@ -1,5 +1,13 @@
 //! The hydroflex service: coordinator, REST interface, predictions, and the command line around them.
 
+#![cfg_attr(
+    test,
+    allow(
+        clippy::cast_possible_truncation,
+        reason = "small known numbers; equal means equal"
+    )
+)]
+
 pub mod http;
 pub mod coordinator;
 pub mod prediction;

@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 const GRACE: Duration = Duration::from_secs(3);
 
 /// How long a store that is just starting is waited for.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// How to run a service.
 #[derive(Debug, Clone)]

@@ -1,5 +1,11 @@
 //! Estimates over HTTP: JSON, tables, the Open Inference Protocol, aliases.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 mod common;
 
 use axum::body::Body;

@@ -1,5 +1,11 @@
 //! Live signals over WebSocket, on a real socket.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 mod common;
 
 use common::Desk;

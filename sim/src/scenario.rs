@@ -27,7 +27,7 @@ pub const SETTLING_OPEN_PART: f64 = 0.2;
 /// Shortest and longest settling run, s; between them it lasts as long as the job's runs.
 pub const SETTLING_DURATION_S: [f64; 2] = [1.0, 2.0];
 
-/// Why a run cannot be planned; [`validate`] finds these before any run is.
+/// Why a run cannot be planned; [`validate()`] finds these before any run is.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ScenarioError {
     /// The job has no run of that index.

@@ -1,6 +1,13 @@
 //! The accurate integrator of planar machines: run for run the same in any company, and never
 //! without an end.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 use hydroflex_openapi::job::{Integrator, RunFlag};
 use hydroflex_sim::fast::{InstructionSet, PlanarModel, TOLERANCE, Workspace};
 use hydroflex_sim::machine::Machine;

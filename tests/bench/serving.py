@@ -460,7 +460,7 @@ def felt(bench, rounds):
     text = (pathlib.Path(__file__).parents[2] / "docs" / "benchmark-simulator.md").read_text()
 
     def simulated(row):
-        found = re.search(rf"^\\| {re.escape(row)} \\|(.*)\\|$", text, re.MULTILINE)
+        found = re.search(rf"^\| {re.escape(row)} \|(.*)\|$", text, re.MULTILINE)
         return statistics.median(float(cell) * 1e3 for cell in found[1].split("|"))
 
     rows = {

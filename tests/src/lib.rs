@@ -9,6 +9,8 @@
 #[path = "../../server/ledger/tests/servers/mod.rs"]
 pub mod servers;
 pub mod proxy;
+pub mod network;
+pub mod clock;
 
 use anyhow::{Context, bail, ensure};
 use hydroflex_openapi::status::JobStatus;
@@ -16,13 +18,14 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use sha2::{Digest, Sha256};
 use std::io::{BufRead, BufReader};
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Longest wait for anything. Tests wait for conditions; this only ends one that hangs.
-const PATIENCE: Duration = Duration::from_secs(240);
+const PATIENCE: Duration = Duration::from_mins(4);
 
 /// The hydroflex binary: `HYDROFLEX_BIN`, or the one built beside this test.
 ///
@@ -49,6 +52,19 @@ pub fn binary() -> anyhow::Result<PathBuf> {
     Ok(path)
 }
 
+/// The program, in a network namespace or on this machine. `ip` becomes the program: the process is the same.
+fn program(namespace: Option<&str>) -> anyhow::Result<Command> {
+    let binary = binary()?;
+    Ok(match namespace {
+        Some(name) => {
+            let mut command = Command::new("ip");
+            command.args(["netns", "exec", name]).arg(binary);
+            command
+        }
+        None => Command::new(binary),
+    })
+}
+
 /// How a service under test is started.
 #[derive(Debug, Clone, Default)]
 pub struct Start {
@@ -60,6 +76,8 @@ pub struct Start {
     pub database: Option<String>,
     /// Store URL; a directory if absent.
     pub store: Option<String>,
+    /// Network namespace in which it runs; this machine's if absent.
+    pub namespace: Option<String>,
 }
 
 /// A running `hydroflex serve`; killed when dropped.
@@ -76,7 +94,7 @@ impl ServiceUnderTest {
     /// # Errors
     /// If it does not, with what it said.
     pub fn start(data: &Path, start: &Start) -> anyhow::Result<Self> {
-        let mut command = Command::new(binary()?);
+        let mut command = program(start.namespace.as_deref())?;
         command
             .args([
                 "serve",
@@ -123,6 +141,15 @@ impl ServiceUnderTest {
             let _ = child.wait();
             let said = log.lock().map(|log| log.join("\n")).unwrap_or_default();
             bail!("the service does not serve; it said:\n{said}");
+        };
+        let url = match &start.namespace {
+            Some(name) => {
+                let port = url.rsplit(':').next().and_then(|port| port.parse().ok());
+                let port = port.with_context(|| format!("{url} has no port"))?;
+                let here = network::forward(Ipv4Addr::LOCALHOST, port, Some(name.clone()))?;
+                format!("http://127.0.0.1:{here}")
+            }
+            None => url,
         };
         hydroflex_ledger::tls::ready();
         let http = reqwest::blocking::Client::builder()
@@ -382,7 +409,22 @@ impl Pilot {
         environment: &[(&'static str, String)],
         arguments: &[&str],
     ) -> anyhow::Result<Self> {
-        let child = Command::new(binary()?)
+        Self::start_in(None, database, store, cache, environment, arguments)
+    }
+
+    /// Starts one in a network namespace.
+    ///
+    /// # Errors
+    /// If the program cannot be started.
+    pub fn start_in(
+        namespace: Option<&str>,
+        database: &str,
+        store: &str,
+        cache: &Path,
+        environment: &[(&'static str, String)],
+        arguments: &[&str],
+    ) -> anyhow::Result<Self> {
+        let child = program(namespace)?
             .args(["worker", "--database", database, "--store", store])
             .arg("--cache")
             .arg(cache)

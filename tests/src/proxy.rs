@@ -1,7 +1,7 @@
 //! A proxy between a service and its store that can fail, hang, or cut what passes.
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -35,7 +35,15 @@ impl Proxy {
     /// # Errors
     /// If no port can be listened on.
     pub fn start(to: u16) -> std::io::Result<Self> {
-        let listener = TcpListener::bind("127.0.0.1:0")?;
+        Self::start_at(Ipv4Addr::LOCALHOST, to)
+    }
+
+    /// Starts a proxy that listens on an address of this machine.
+    ///
+    /// # Errors
+    /// If no port can be listened on.
+    pub fn start_at(address: Ipv4Addr, to: u16) -> std::io::Result<Self> {
+        let listener = TcpListener::bind((address, 0))?;
         let port = listener.local_addr()?.port();
         let shared = Arc::new(Mutex::new(Shared {
             mode: Mode::Pass,

@@ -3,7 +3,7 @@
 use crate::machines::ReadyMachine;
 use crate::run;
 use bytes::Bytes;
-use hydroflex_dataset::{RunKind, RunRecord, ShardError, ShardSchema, ShardWriter};
+use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, ShardError, ShardSchema, ShardWriter};
 use hydroflex_ledger::crash::crash_point_of;
 use hydroflex_ledger::{Claim, ShardKind};
 use hydroflex_openapi::job::{JobSpec, RunStatus};
@@ -89,6 +89,7 @@ pub fn make(
             .simulator
             .channels()
             .iter()
+            .filter(|channel| spec.keeps(&channel.name))
             .map(|channel| channel.name.clone())
             .collect(),
         angles: machine
@@ -149,8 +150,30 @@ pub fn records(
     simulate(spec, machine, kind, runs, &ShardControl::default())
 }
 
-/// Simulates some runs on one thread: together, or one by one if that panics, to name the culprit.
 fn simulate(
+    spec: &JobSpec,
+    machine: &ReadyMachine,
+    kind: RunKind,
+    runs: &[u64],
+    control: &ShardControl,
+) -> Result<Vec<RunRecord>, ShardFailure> {
+    let mut records = simulate_whole(spec, machine, kind, runs, control)?;
+    if !spec.columns.is_empty() {
+        for record in &mut records {
+            if let RunOutcome::Ok(samples) = &mut record.outcome {
+                let mut channels = machine.simulator.channels().iter();
+                samples
+                    .columns
+                    .retain(|_| channels.next().is_some_and(|channel| spec.keeps(&channel.name)));
+            }
+        }
+    }
+    Ok(records)
+}
+
+/// Simulates some runs on one thread: together, or one by one if that panics, to name the culprit. With
+/// every column of the simulator.
+fn simulate_whole(
     spec: &JobSpec,
     machine: &ReadyMachine,
     kind: RunKind,

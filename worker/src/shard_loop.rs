@@ -22,7 +22,7 @@ const LOOK: Duration = Duration::from_millis(500);
 /// Longest wait between two looks for work.
 const LONGEST_IDLE: Duration = Duration::from_millis(100);
 /// How long the database or the store may be away before a shard is given back.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// How a worker works.
 #[derive(Debug, Clone)]
@@ -53,7 +53,7 @@ pub struct RunLimits {
 impl Default for RunLimits {
     fn default() -> Self {
         Self {
-            time: Duration::from_secs(600),
+            time: Duration::from_mins(10),
             memory_bytes: 4 << 30,
         }
     }
@@ -147,7 +147,8 @@ async fn connect(url: &str, mut stop: watch::Receiver<bool>) -> anyhow::Result<O
 impl Worker {
     /// Works under one name. `None` if the name was given up by the coordinator.
     async fn live(&self, name: &str, deadline: Option<Instant>) -> Result<Option<Ended>, LedgerError> {
-        self.ledger.register_worker(name).await?;
+        let level = hydroflex_sim::instruction_set::level();
+        self.ledger.register_worker(name, Some(level)).await?;
         let alive = Arc::new(AtomicBool::new(true));
         let heart = tokio::spawn(beat(self.ledger.clone(), name.to_owned(), alive.clone()));
         let ended = self.claim_and_work(name, deadline, &alive).await;

@@ -7,6 +7,11 @@
 //! DATASET is a data set of the boom with some 2,000 runs; they are encoded in several ways on one
 //! thread, best of five. (Repeating fewer runs would let zstd find the repeats.)
 
+#![allow(
+    clippy::print_stdout,
+    reason = "a benchmark prints, and stops at what it did not expect"
+)]
+
 use arrow::array::{ArrayRef, Float32Array, Float64Array, RecordBatch};
 use arrow::datatypes::{DataType, Field, Schema};
 use hydroflex_dataset::{
@@ -67,6 +72,7 @@ fn main() -> Result<(), Failure> {
             sample_time_s: dataset.sample_time_s(),
             sample_type,
             split: Split::default(),
+            file_size_mb: hydroflex_dataset::cut::FILE_SIZE_MB,
             lengths: RunLengths::Listed(loaded.iter().map(|r| r.sample_count as u64).collect()),
         };
         let name = format!("{sample_type:?}").to_lowercase();

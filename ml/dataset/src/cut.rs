@@ -9,9 +9,15 @@ use hydroflex_openapi::dataset::SplitName;
 /// fetch a part over HTTP.
 pub const ROW_GROUP_ROWS: u64 = 16_384;
 
-/// A new file begins with the row group whose first run would exceed this, uncompressed; compressed
-/// it is about half.
-pub const FILE_BYTES: u64 = 256 << 20;
+/// Size of files of samples where nobody asks for another, in MB.
+pub const FILE_SIZE_MB: u32 = 128;
+
+/// A new file begins with the row group whose first run would exceed this, uncompressed: samples take about
+/// half on disk.
+#[must_use]
+pub fn uncompressed_bytes(file_size_mb: u32) -> u64 {
+    u64::from(file_size_mb) << 21
+}
 
 /// Place of a run in the files of its part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +32,7 @@ pub struct Place {
 #[derive(Debug, Clone)]
 pub struct Cutter {
     bytes_per_row: u64,
+    bytes_per_file: u64,
     next: Place,
     group_rows: u64,
     file_bytes: u64,
@@ -33,11 +40,12 @@ pub struct Cutter {
 }
 
 impl Cutter {
-    /// For rows of this uncompressed size.
+    /// For rows and files of this uncompressed size.
     #[must_use]
-    pub fn new(bytes_per_row: u64) -> Self {
+    pub fn new(bytes_per_row: u64, bytes_per_file: u64) -> Self {
         Self {
             bytes_per_row,
+            bytes_per_file,
             next: Place {
                 file: 0,
                 row_group: 0,
@@ -55,7 +63,7 @@ impl Cutter {
             self.group_rows = 0;
         }
         let bytes = rows * self.bytes_per_row;
-        if self.any && self.group_rows == 0 && self.file_bytes + bytes > FILE_BYTES {
+        if self.any && self.group_rows == 0 && self.file_bytes + bytes > self.bytes_per_file {
             self.next = Place {
                 file: self.next.file + 1,
                 row_group: 0,
@@ -88,16 +96,18 @@ mod tests {
     #[test]
     fn groups_hold_whole_runs_and_files_hold_whole_groups() {
         let (rows, bytes_per_row) = (201, 160);
-        let mut cutter = Cutter::new(bytes_per_row);
+        let mut cutter = Cutter::new(bytes_per_row, uncompressed_bytes(FILE_SIZE_MB));
         let places: Vec<Place> = (0..20_000).map(|_| cutter.place(rows)).collect();
         // 82 runs of 201 rows are the first number above 16384 rows
         assert_eq!(places[81].row_group, 0);
         assert_eq!(places[82].row_group, 1);
         let per_file = places.iter().filter(|place| place.file == 0).count() as u64;
         assert_eq!(per_file % 82, 0);
-        assert!(per_file * rows * bytes_per_row <= FILE_BYTES + 82 * rows * bytes_per_row);
+        assert!(
+            per_file * rows * bytes_per_row <= uncompressed_bytes(FILE_SIZE_MB) + 82 * rows * bytes_per_row
+        );
         assert_eq!(cutter.files(), places.last().unwrap().file + 1);
-        let mut one = Cutter::new(bytes_per_row);
+        let mut one = Cutter::new(bytes_per_row, uncompressed_bytes(FILE_SIZE_MB));
         assert_eq!(one.files(), 0);
         assert_eq!(
             one.place(10_000_000),

@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 pub struct Dataset {
     root: PathBuf,
     manifest: Manifest,
-    dataset_sha256: String,
+    sha256: String,
     runs: Vec<RunRow>,
 }
 
@@ -179,7 +179,7 @@ impl Dataset {
         Ok(Self {
             root,
             manifest,
-            dataset_sha256: hex::encode(Sha256::digest(&sums)),
+            sha256: hex::encode(Sha256::digest(&sums)),
             runs,
         })
     }
@@ -235,7 +235,7 @@ impl Dataset {
     /// Hash of the data set, hexadecimal.
     #[must_use]
     pub fn dataset_sha256(&self) -> &str {
-        &self.dataset_sha256
+        &self.sha256
     }
 
     /// Channels of the samples.
@@ -307,7 +307,7 @@ impl Dataset {
     /// # Errors
     /// A channel is unknown or a file damaged.
     pub fn load(&self, split: SplitName, channels: &[&str]) -> Result<Vec<RunColumns>, OpenError> {
-        self.iter(split, channels)?.collect()
+        self.stream(split, channels)?.collect()
     }
 
     /// As [`Self::load`], all parts, sorted by `run_id`.
@@ -345,7 +345,7 @@ impl Dataset {
     ///
     /// # Errors
     /// A channel is unknown.
-    pub fn iter(&self, split: SplitName, channels: &[&str]) -> Result<RunIter, OpenError> {
+    pub fn stream(&self, split: SplitName, channels: &[&str]) -> Result<RunIter, OpenError> {
         let prefix = format!("data/{split}-");
         let files = self
             .manifest
@@ -410,7 +410,7 @@ impl RunIter {
             if let Some((batch, row)) = &mut self.batch
                 && *row < batch.num_rows()
             {
-                let (path, _) = self.reader.as_ref().map_or((Path::new(""), ()), |r| (&r.0, ()));
+                let path: &Path = self.reader.as_ref().map_or(Path::new(""), |(path, _)| path);
                 let done = take_rows(path, batch, row, &self.channels, &mut self.run)?;
                 if done.is_some() {
                     return Ok(done);

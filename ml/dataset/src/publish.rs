@@ -49,6 +49,8 @@ pub struct PublishSpec {
     pub sample_type: SampleType,
     /// How runs are divided.
     pub split: Split,
+    /// Size of a file of samples, about, in MB.
+    pub file_size_mb: u32,
     /// Planned lengths of the runs, failed or not.
     pub lengths: RunLengths,
 }
@@ -92,9 +94,10 @@ impl RunLengths {
 }
 
 impl PublishSpec {
-    /// The specification of a job's data set.
+    /// The specification of a job's data set; of the machine's `channels` it has those that the job keeps.
     #[must_use]
-    pub fn of_job(spec: JobSpec, machine: MachineFacts, code: CodeFacts, channels: Vec<Channel>) -> Self {
+    pub fn of_job(spec: JobSpec, machine: MachineFacts, code: CodeFacts, mut channels: Vec<Channel>) -> Self {
+        channels.retain(|channel| spec.keeps(&channel.name));
         Self {
             machine,
             code,
@@ -102,6 +105,7 @@ impl PublishSpec {
             sample_time_s: spec.sample_time_s,
             sample_type: spec.sample_type,
             split: spec.split,
+            file_size_mb: spec.file_size_mb,
             lengths: RunLengths::Uniform {
                 runs: spec.runs,
                 rows: spec.steps() as u64 + 1,
@@ -457,11 +461,10 @@ impl<S: Sink> Publisher<S> {
             files: output.sorted(),
         };
         output.write_json("manifest.json", &manifest)?;
-        let sums: String = output
-            .sorted()
-            .iter()
-            .map(|file| format!("{}  {}\n", file.sha256, file.path))
-            .collect();
+        let mut sums = String::new();
+        for file in output.sorted() {
+            sums.extend([file.sha256.as_str(), "  ", file.path.as_str(), "\n"]);
+        }
         output.write("SHA256SUMS", sums.as_bytes())?;
         let published = Published {
             manifest,
@@ -515,7 +518,10 @@ impl<S: Sink> Output<S> {
 
 /// Numbers of files per part, from the planned lengths: one pass of counting, no list of runs.
 fn plan_parts(spec: &PublishSpec) -> BTreeMap<SplitName, Part> {
-    let cutter = Cutter::new(bytes_per_row(spec.channels.len(), spec.sample_type));
+    let cutter = Cutter::new(
+        bytes_per_row(spec.channels.len(), spec.sample_type),
+        cut::uncompressed_bytes(spec.file_size_mb),
+    );
     let mut cutters = BTreeMap::new();
     for index in 0..spec.lengths.runs() {
         cutters

@@ -501,11 +501,10 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
 
 fn list_at(list: &ListArray, row: usize) -> Vec<f64> {
     let values = list.value(row);
-    match values.as_primitive_opt::<Float64Type>() {
-        Some(values) => values.values().to_vec(),
-        None => {
-            let values = values.as_primitive::<Float32Type>();
-            values.values().iter().map(|&x| f64::from(x)).collect()
-        }
+    if let Some(values) = values.as_primitive_opt::<Float64Type>() {
+        values.values().to_vec()
+    } else {
+        let values = values.as_primitive::<Float32Type>();
+        values.values().iter().map(|&x| f64::from(x)).collect()
     }
 }

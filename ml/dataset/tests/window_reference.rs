@@ -4,7 +4,13 @@
 //! `window_text_a` and `window_script_a` were computed beside them, and the table in its README.
 //! Needs HYDROFLEX_REFERENCE; says so and passes without.
 
-use arrow::array::{Array, AsArray};
+#![allow(
+    clippy::print_stdout,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
+use arrow::array::AsArray;
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Float64Type, Int64Type};
 use hydroflex_dataset::window::{band_steps, closing_step, paper_steps, script_steps};

@@ -77,6 +77,7 @@ pub fn check_sample_time(model: &Model, sample_time_s: f64) -> Result<(), Evalua
 ///
 /// # Errors
 /// A channel is missing, a value is not finite, the sample times differ, or no run is long enough.
+#[allow(clippy::too_many_lines, reason = "one stage after the other")]
 pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Evaluation, EvaluateError> {
     let config = model.config();
     check_sample_time(model, runs.sample_time_s)?;

@@ -118,7 +118,7 @@ fn write_folder(out_dir: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), ModelEr
     let mut sums = String::new();
     for (name, content) in files {
         write_durably(&temporary.join(name), content).map_err(file_error(&temporary.join(name)))?;
-        sums.push_str(&format!("{}  {name}\n", hex::encode(Sha256::digest(content))));
+        sums.extend([hex::encode(Sha256::digest(content)).as_str(), "  ", name, "\n"]);
     }
     let path = temporary.join("SHA256SUMS");
     write_durably(&path, sums.as_bytes()).map_err(file_error(&path))?;
@@ -166,8 +166,7 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
         })
         .collect();
     let components = problem.whitening.components();
-    if components > 0 {
-        let size = problem.whitening.projection.len() / components;
+    if let Some(size) = problem.whitening.projection.len().checked_div(components) {
         let first = &mut layers[0];
         let mut weight = Vec::with_capacity(first.bias.len() * size);
         for (row, bias) in first.weight.chunks(components).zip(&mut first.bias) {

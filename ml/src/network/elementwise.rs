@@ -16,6 +16,7 @@ const EXP_LIMIT: f32 = 87.0;
 
 /// e^x for |x| ≤ 87, clamped outside.
 #[inline(always)]
+#[must_use]
 pub fn exp(x: f32) -> f32 {
     // x = k ln 2 + r, |r| ≤ ln 2 / 2; ln 2 in two parts so that k ln 2 is exact.
     const LOG2_E: f32 = std::f32::consts::LOG2_E;
@@ -41,12 +42,14 @@ pub fn exp(x: f32) -> f32 {
 
 /// 1 / (1 + e⁻ˣ).
 #[inline(always)]
+#[must_use]
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
 /// tanh x = 1 − 2 / (e²ˣ + 1), and its Taylor polynomial near 0 where that loses digits.
 #[inline(always)]
+#[must_use]
 pub fn tanh(x: f32) -> f32 {
     let large = 1.0 - 2.0 / (exp(2.0 * x.clamp(-20.0, 20.0)) + 1.0);
     let s = x * x;
@@ -58,6 +61,7 @@ pub fn tanh(x: f32) -> f32 {
 
 /// x for x > 0, eˣ − 1 otherwise.
 #[inline(always)]
+#[must_use]
 pub fn elu(x: f32) -> f32 {
     // eˣ − 1 loses digits near 0: x + x²/2 + x³/6 + x⁴/24 + x⁵/120 there, next term below 4e-8 x.
     let small = x * (1.0 + x * (0.5 + x * (0.166_666_67 + x * (0.041_666_668 + x * 0.008_333_334))));
@@ -73,6 +77,7 @@ pub fn elu(x: f32) -> f32 {
 
 /// The activation of one value.
 #[inline(always)]
+#[must_use]
 pub fn activate(activation: Activation, x: f32) -> f32 {
     match activation {
         Activation::Tanh => tanh(x),

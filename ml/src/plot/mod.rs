@@ -219,7 +219,7 @@ impl Picture {
             self.error_panel(svg, &time, row, top)?;
             top += ERROR_HEIGHT + ROW_GAP;
         }
-        self.time_labels(svg, &time, top - ROW_GAP)?;
+        time_labels(svg, &time, top - ROW_GAP)?;
         writeln!(svg, "</svg>")
     }
 
@@ -375,25 +375,6 @@ impl Picture {
         }
         writeln!(svg, "\"/>")
     }
-
-    fn time_labels(&self, svg: &mut String, time: &Axis, bottom: f64) -> std::fmt::Result {
-        let ticks = time.ticks(10);
-        for &tick in &ticks {
-            let x = time.px(tick);
-            writeln!(
-                svg,
-                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{QUIET}\">{}</text>",
-                bottom + 18.0,
-                label(tick, tick_step(&ticks))
-            )?;
-        }
-        let middle = (LEFT + WIDTH - RIGHT) / 2.0;
-        writeln!(
-            svg,
-            "<text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">Time [s]</text>",
-            bottom + 40.0
-        )
-    }
 }
 
 fn tick_step(ticks: &[f64]) -> f64 {
@@ -459,6 +440,25 @@ fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")
+}
+
+fn time_labels(svg: &mut String, time: &Axis, bottom: f64) -> std::fmt::Result {
+    let ticks = time.ticks(10);
+    for &tick in &ticks {
+        let x = time.px(tick);
+        writeln!(
+            svg,
+            "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{QUIET}\">{}</text>",
+            bottom + 18.0,
+            label(tick, tick_step(&ticks))
+        )?;
+    }
+    let middle = (LEFT + WIDTH - RIGHT) / 2.0;
+    writeln!(
+        svg,
+        "<text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">Time [s]</text>",
+        bottom + 40.0
+    )
 }
 
 #[cfg(test)]

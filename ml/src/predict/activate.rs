@@ -54,15 +54,15 @@ unsafe fn tanh<S: Simd>(x: S::F) -> S::F {
     const LARGE: f32 = 7.905_311;
     let x = clamp::<S>(x, -LARGE, LARGE);
     let s = S::mul(x, x);
-    let mut p = horner::<S>(s, S::splat(-2.760_768_5e-16), 2.000_187_9e-13);
-    p = horner::<S>(s, p, -8.604_671_5e-11);
+    let mut p = horner::<S>(s, S::splat(-2.760_768_5e-16), 2.000_188e-13);
+    p = horner::<S>(s, p, -8.604_672e-11);
     p = horner::<S>(s, p, 5.122_297_1e-8);
     p = horner::<S>(s, p, 1.485_722_36e-5);
     p = horner::<S>(s, p, 6.372_619_3e-4);
     p = horner::<S>(s, p, 4.893_524_6e-3);
-    let mut q = horner::<S>(s, S::splat(1.198_258_4e-6), 1.185_347_06e-4);
+    let mut q = horner::<S>(s, S::splat(1.198_258_4e-6), 1.185_347_1e-4);
     q = horner::<S>(s, q, 2.268_434_6e-3);
-    q = horner::<S>(s, q, 4.893_525_2e-3);
+    q = horner::<S>(s, q, 4.893_525e-3);
     S::div(S::mul(x, p), q)
 }
 

@@ -3,6 +3,7 @@
 #![allow(
     unsafe_code,
     clippy::inline_always,
+    clippy::needless_range_loop,
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
 
@@ -71,7 +72,7 @@ macro_rules! scaled {
                 let mut outside = 0_u64;
                 for i in 0..values.len() {
                     let value = values[i] as f64;
-                    outside |= u64::from(!(value >= min[i])) | u64::from(!(value <= max[i]));
+                    outside |= u64::from(!(min[i] <= value && value <= max[i]));
                 }
                 *inside = outside == 0;
             }

@@ -8,6 +8,7 @@
     unsafe_code,
     unsafe_op_in_unsafe_fn,
     clippy::inline_always,
+    clippy::needless_range_loop,
     reason = "instructions beyond the baseline are unsafe to name, and have to be inlined to be one instruction each"
 )]
 
@@ -64,9 +65,15 @@ macro_rules! dispatch {
             #[allow(unsafe_code, reason = "the features were detected")]
             // SAFETY: `level` returns this only where the features were detected.
             $crate::predict::simd::Level::Avx2 => unsafe { avx2($($name),*) },
+            #[cfg(not(target_arch = "x86_64"))]
             #[allow(unsafe_code, reason = "the baseline")]
             // SAFETY: this type needs the target's baseline only.
-            _ => unsafe { $owner::$body::<$crate::predict::simd::Portable>($($name),*) },
+            $crate::predict::simd::Level::Avx512 | $crate::predict::simd::Level::Avx2 => unsafe {
+                $owner::$body::<$crate::predict::simd::Portable>($($name),*)
+            },
+            #[allow(unsafe_code, reason = "the baseline")]
+            // SAFETY: this type needs the target's baseline only.
+            $crate::predict::simd::Level::Portable => unsafe { $owner::$body::<$crate::predict::simd::Portable>($($name),*) },
         }
     }};
 }

@@ -10,6 +10,8 @@
     unsafe_code,
     unsafe_op_in_unsafe_fn,
     clippy::inline_always,
+    clippy::needless_range_loop,
+    clippy::too_many_arguments,
     reason = "vector code has to be inlined into the function that enables the instructions, and a bound check per \
               load would double its cost: lengths are compared before the loops"
 )]

@@ -164,6 +164,7 @@ impl Problem {
     ///
     /// # Errors
     /// The data cannot answer the specification.
+    #[allow(clippy::too_many_lines, reason = "one check after the other")]
     pub fn new(data: &TrainingData, spec: &TrainingSpec) -> Result<Self, TrainError> {
         let spec = with_defaults(data, spec);
         check_names(&spec)?;

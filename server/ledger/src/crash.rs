@@ -59,7 +59,7 @@ pub fn crash_point(point: &str) {
     tracing::warn!(point, "dying here because {CRASH_AT} asks for it");
     match std::env::var(CRASH_HOW).as_deref() {
         Ok("hang") => loop {
-            std::thread::sleep(std::time::Duration::from_secs(3600));
+            std::thread::sleep(std::time::Duration::from_hours(1));
         },
         Ok("eat") => {
             let mut eaten: Vec<Vec<u8>> = Vec::new();

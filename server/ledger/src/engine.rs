@@ -8,7 +8,7 @@ use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
 };
-use sqlx::{Connection as _, Postgres, Row as _, Sqlite};
+use sqlx::{Connection as _, Executor as _, Postgres, Row as _, Sqlite};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -153,6 +153,11 @@ pub(crate) enum Transaction {
 /// How long a writer waits for another one before it gives up. Transactions here take milliseconds,
 /// but a full disk queue or a stopped process can hold one much longer.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+/// What PostgreSQL is told by every session: nobody sleeps in a transaction for longer, and a peer that
+/// does not answer for half a minute is gone.
+const GIVE_UP_THE_SILENT: &str = "SET idle_in_transaction_session_timeout = '15s'; \
+    SET tcp_keepalives_idle = 10; SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 4; \
+    SET tcp_user_timeout = '30s'";
 
 macro_rules! bind_all {
     ($statement:expr, $parameters:expr) => {{
@@ -189,9 +194,14 @@ impl Pool {
                 .await?;
             Ok(Self::Sqlite(pool))
         } else if url.starts_with("postgres:") || url.starts_with("postgresql:") {
+            // A machine that is cut off in the middle of a transaction holds its locks until the server
+            // gives it up, by default after two hours: every other worker would wait for it.
             let pool = PgPoolOptions::new()
                 .max_connections(connections)
                 .acquire_timeout(BUSY_TIMEOUT)
+                .after_connect(|connection, _| {
+                    Box::pin(async move { connection.execute(GIVE_UP_THE_SILENT).await.map(drop) })
+                })
                 .connect(url)
                 .await?;
             Ok(Self::Postgres(pool))

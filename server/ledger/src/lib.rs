@@ -43,10 +43,11 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 3] = [
+const SCHEMA: [&str; 4] = [
     include_str!("../migrations/0001_ledger.sql"),
     include_str!("../migrations/0002_aliases.sql"),
     include_str!("../migrations/0003_keys.sql"),
+    include_str!("../migrations/0004_instruction_sets.sql"),
 ];
 
 /// The shared record of what is to be done and what is done.
@@ -78,7 +79,7 @@ impl Ledger {
         };
         match ledger.schema_version().await? {
             0 => Err(LedgerError::NoSchema),
-            version => ledger.refuse_newer(version).map(|()| ledger),
+            version => Self::refuse_newer(version).map(|()| ledger),
         }
     }
 
@@ -101,7 +102,7 @@ impl Ledger {
         self.pool.close().await;
     }
 
-    fn refuse_newer(&self, found: u64) -> Result<(), LedgerError> {
+    fn refuse_newer(found: u64) -> Result<(), LedgerError> {
         let known = SCHEMA.len() as u64;
         if found > known {
             Err(LedgerError::NewerSchema { found, known })
@@ -129,7 +130,7 @@ impl Ledger {
     }
 
     async fn migrate(&self) -> Result<(), LedgerError> {
-        self.refuse_newer(self.schema_version().await?)?;
+        Self::refuse_newer(self.schema_version().await?)?;
         let mut tx = self.pool.begin().await?;
         if self.engine() == Engine::Postgres {
             // Two coordinators may start at once; SQLite's write lock orders them by itself.
@@ -140,13 +141,12 @@ impl Ledger {
             &[],
         )
         .await?;
-        let done = match tx.row("SELECT version FROM hydroflex_schema", &[]).await? {
-            Some(row) => row.count("version")?,
-            None => {
-                tx.execute("INSERT INTO hydroflex_schema (version) VALUES (0)", &[])
-                    .await?;
-                0
-            }
+        let done = if let Some(row) = tx.row("SELECT version FROM hydroflex_schema", &[]).await? {
+            row.count("version")?
+        } else {
+            tx.execute("INSERT INTO hydroflex_schema (version) VALUES (0)", &[])
+                .await?;
+            0
         };
         for (index, script) in SCHEMA.into_iter().enumerate() {
             if index as u64 >= done {

@@ -22,6 +22,8 @@ pub struct JobRecord {
     pub spec: JobSpec,
     /// SHA-256 of the machine.
     pub machine_sha256: String,
+    /// Instruction-set level of the workers that compute it; `None` before the first one begins.
+    pub instruction_set: Option<String>,
     /// Runs `0..runs_planned` are cut into shards.
     pub runs_planned: u64,
     /// Settling runs `0..settling_planned` are cut into shards.
@@ -85,6 +87,7 @@ impl JobRecord {
             state,
             spec: row.json("spec")?,
             machine_sha256: row.text("machine_sha256")?,
+            instruction_set: row.optional_text("instruction_set")?,
             runs_planned: row.count("runs_planned")?,
             settling_planned: row.count("settling_planned")?,
             progress,

@@ -41,7 +41,7 @@ fn place(rest: &str) -> Result<Place, BlobError> {
             &bucket
                 .chars()
                 .take(63)
-                .filter(|c| c.is_ascii_graphic())
+                .filter(char::is_ascii_graphic)
                 .collect::<String>(),
             "3 to 63 small letters, digits, dots and hyphens; credentials go into AWS_ACCESS_KEY_ID and \
              AWS_SECRET_ACCESS_KEY",

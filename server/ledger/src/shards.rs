@@ -222,7 +222,8 @@ impl Ledger {
     }
 
     /// Takes the next shard: of the most urgent, then oldest job; settling runs first, then in run
-    /// order. `None` if there is nothing to do, or the worker has been given up.
+    /// order. Only of jobs that nobody has begun, or that were begun on the worker's instruction-set
+    /// level. `None` if there is nothing to do, or the worker has been given up.
     ///
     /// # Errors
     /// Passes on what the database says.
@@ -231,9 +232,10 @@ impl Ledger {
         let any = self
             .pool
             .row(
-                "SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
-                 WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') LIMIT 1",
-                &[],
+                "SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id JOIN workers w ON w.name = $1 \
+                 WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') \
+                 AND (j.instruction_set IS NULL OR j.instruction_set = w.instruction_set) LIMIT 1",
+                values![worker],
             )
             .await?;
         if any.is_none() {
@@ -243,15 +245,17 @@ impl Ledger {
         let statement = match self.engine() {
             Engine::Sqlite => {
                 "UPDATE shards SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', worker = $1 \
-                 WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
+                 WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id JOIN workers w ON w.name = $1 \
                    WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') \
+                   AND (j.instruction_set IS NULL OR j.instruction_set = w.instruction_set) \
                    ORDER BY j.priority DESC, j.id, s.kind DESC, s.first_run LIMIT 1) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
             }
             Engine::Postgres => {
                 "UPDATE shards SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', worker = $1 \
-                 WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id \
+                 WHERE id = (SELECT s.id FROM shards s JOIN jobs j ON j.id = s.job_id JOIN workers w ON w.name = $1 \
                    WHERE s.state = 'open' AND j.state IN ('queued', 'simulating', 'publishing') \
+                   AND (j.instruction_set IS NULL OR j.instruction_set = w.instruction_set) \
                    ORDER BY j.priority DESC, j.id, s.kind DESC, s.first_run LIMIT 1 \
                    FOR UPDATE OF s SKIP LOCKED) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
@@ -269,19 +273,28 @@ impl Ledger {
             "UPDATE jobs SET state = $2, started_ms = $3, reason = $4 WHERE id = $1 AND state = 'queued'",
         )
         .await?;
-        let job = tx
+        tx.execute(
+            "UPDATE jobs SET instruction_set = (SELECT instruction_set FROM workers WHERE name = $2) \
+             WHERE id = $1 AND instruction_set IS NULL",
+            values![shard.job_id.to_string(), worker],
+        )
+        .await?;
+        let row = tx
             .row(
-                "SELECT * FROM jobs WHERE id = $1",
-                values![shard.job_id.to_string()],
+                "SELECT j.*, w.instruction_set AS worker_set FROM jobs j, workers w \
+                 WHERE j.id = $1 AND w.name = $2",
+                values![shard.job_id.to_string(), worker],
             )
             .await?
             .ok_or_else(|| LedgerError::NoJob {
                 id: shard.job_id.to_string(),
             })?;
-        let claim = Claim {
-            job: JobRecord::read(&job)?,
-            shard,
-        };
+        let job = JobRecord::read(&row)?;
+        if job.instruction_set != row.optional_text("worker_set")? {
+            // A worker of another level has begun the same job a moment ago: nothing is taken.
+            return Ok(None);
+        }
+        let claim = Claim { job, shard };
         tx.commit().await?;
         Ok(Some(claim))
     }

@@ -10,18 +10,25 @@ pub struct Beat {
     pub worker: String,
     /// How often it has reported; a number that stands still means a worker that does.
     pub beat: u64,
+    /// Instruction-set level of its numbers; `None` if it takes no shards.
+    pub instruction_set: Option<String>,
 }
 
 impl Ledger {
-    /// Enters a worker under a name that has never been used.
+    /// Enters a worker under a name that has never been used, with the instruction-set level that its
+    /// numbers depend on; `None` for one that takes no shards.
     ///
     /// # Errors
     /// Passes on what the database says.
-    pub async fn register_worker(&self, name: &str) -> Result<(), LedgerError> {
+    pub async fn register_worker(
+        &self,
+        name: &str,
+        instruction_set: Option<&str>,
+    ) -> Result<(), LedgerError> {
         self.pool
             .execute(
-                "INSERT INTO workers (name, state, beat, started_ms) VALUES ($1, 'alive', 0, $2)",
-                values![name, clock::now_ms()],
+                "INSERT INTO workers (name, state, beat, started_ms, instruction_set) VALUES ($1, 'alive', 0, $2, $3)",
+                values![name, clock::now_ms(), instruction_set.map(str::to_owned)],
             )
             .await
             .map(drop)
@@ -49,7 +56,7 @@ impl Ledger {
     pub async fn beats(&self) -> Result<Vec<Beat>, LedgerError> {
         self.pool
             .rows(
-                "SELECT name, beat FROM workers WHERE state = 'alive' ORDER BY name",
+                "SELECT name, beat, instruction_set FROM workers WHERE state = 'alive' ORDER BY name",
                 &[],
             )
             .await?
@@ -58,6 +65,7 @@ impl Ledger {
                 Ok(Beat {
                     worker: row.text("name")?,
                     beat: row.count("beat")?,
+                    instruction_set: row.optional_text("instruction_set")?,
                 })
             })
             .collect()

@@ -1,6 +1,11 @@
 //! One suite for every engine and every store: what the ledger and its blobs promise, whatever stands
 //! below them.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 #[allow(
     dead_code,
     unreachable_pub,
@@ -74,7 +79,7 @@ async fn sqlite(folder: &tempfile::TempDir) -> Ledger {
 
 async fn with_workers(ledger: Ledger) -> Ledger {
     for worker in ["a", "b"] {
-        ledger.register_worker(worker).await.unwrap();
+        ledger.register_worker(worker, Some("x86-64-v3")).await.unwrap();
     }
     ledger
 }
@@ -121,6 +126,7 @@ on_every_engine![
     many_workers_share_without_overlap,
     pages_of_jobs_are_newest_first,
     urgent_jobs_go_first,
+    a_job_is_computed_on_one_instruction_set,
     given_up_runs_are_done_again_and_nothing_else,
     failed_trainings_are_done_again_and_nothing_else,
     a_key_is_found_by_its_hash_until_it_is_revoked,
@@ -709,7 +715,7 @@ async fn a_data_set_appears_once_with_its_trainings(ledger: Ledger) {
 
     // Another job that leads to the same content finds the data set there already.
     let twin = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
-    ledger.register_worker("c").await.unwrap();
+    ledger.register_worker("c", Some("x86-64-v3")).await.unwrap();
     let claim = ledger.begin_shard("c").await.unwrap().unwrap();
     ledger
         .commit_shard(&claim, &result(&claim.object()))
@@ -793,7 +799,7 @@ async fn many_workers_share_without_overlap(ledger: Ledger) {
         let ledger = ledger.clone();
         tasks.push(tokio::spawn(async move {
             let name = format!("worker-{number}");
-            ledger.register_worker(&name).await.unwrap();
+            ledger.register_worker(&name, Some("x86-64-v3")).await.unwrap();
             let mut runs = Vec::new();
             while let Some(claim) = ledger.begin_shard(&name).await.unwrap() {
                 runs.push(claim.shard.first_run);
@@ -853,6 +859,24 @@ async fn urgent_jobs_go_first(ledger: Ledger) {
         begun.push(claim.job.id);
     }
     assert_eq!(begun, [ids[2], ids[1], ids[3], ids[0]]);
+}
+
+async fn a_job_is_computed_on_one_instruction_set(ledger: Ledger) {
+    ledger.register_worker("c", Some("x86-64-v4")).await.unwrap();
+    let first = ledger.create_job(&new_job(&[2, 2]), None).await.unwrap().id();
+    let second = ledger.create_job(&new_job(&[2, 2]), None).await.unwrap().id();
+    let job_of = async |worker: &str| {
+        let claim = ledger.begin_shard(worker).await.unwrap()?;
+        Some((claim.job.id, claim.job.instruction_set.unwrap()))
+    };
+    let (v3, v4) = ("x86-64-v3".to_owned(), "x86-64-v4".to_owned());
+    assert_eq!(job_of("a").await, Some((first, v3.clone())));
+    // The older job is begun on another level: the newer one is the first that this worker may take.
+    assert_eq!(job_of("c").await, Some((second, v4.clone())));
+    assert_eq!(job_of("c").await, Some((second, v4)));
+    assert_eq!(job_of("c").await, None);
+    assert_eq!(job_of("b").await, Some((first, v3)));
+    assert_eq!(job_of("b").await, None);
 }
 
 async fn a_key_is_found_by_its_hash_until_it_is_revoked(ledger: Ledger) {

@@ -1,6 +1,12 @@
 //! The ledger against a model of it, under any order of begin, commit, loss, release and cancel, by
 //! workers that may be late or gone.
 
+#![allow(
+    clippy::too_many_lines,
+    clippy::unwrap_used,
+    reason = "a test stops at what it did not expect; its numbers are small"
+)]
+
 use hydroflex_ledger::transition::{AfterLoss, ShardState, after_loss};
 use hydroflex_ledger::{Claim, CommitOutcome, Ledger, NewJob, ShardKind, ShardResult};
 use hydroflex_openapi::status::{JobState, TimeSplit};
@@ -121,7 +127,7 @@ async fn play(steps: Vec<Step>) {
     }
     let mut names: Vec<String> = (0..3).map(|number| format!("w{number}-0")).collect();
     for name in &names {
-        ledger.register_worker(name).await.unwrap();
+        ledger.register_worker(name, Some("x86-64-v3")).await.unwrap();
     }
     let mut claims: Vec<Claim> = Vec::new();
 
@@ -204,7 +210,10 @@ async fn play(steps: Vec<Step>) {
                     assert!(model.lose(key, epoch));
                 }
                 names[worker] = format!("w{worker}-{}", number + 1);
-                ledger.register_worker(&names[worker]).await.unwrap();
+                ledger
+                    .register_worker(&names[worker], Some("x86-64-v3"))
+                    .await
+                    .unwrap();
             }
             Step::Cancel => {
                 let over = model.cancelled;

@@ -113,13 +113,12 @@ async fn work(command: Command) -> anyhow::Result<()> {
 
 /// A database that is not there yet is made: keys may come before the first start of the service.
 async fn open(args: &LedgerArgs) -> anyhow::Result<Ledger> {
-    let url = match &args.database {
-        Some(url) => url.clone(),
-        None => {
-            std::fs::create_dir_all(&args.data)
-                .with_context(|| format!("cannot make {}", args.data.display()))?;
-            format!("sqlite:{}", args.data.join("ledger.sqlite").display())
-        }
+    let url = if let Some(url) = &args.database {
+        url.clone()
+    } else {
+        std::fs::create_dir_all(&args.data)
+            .with_context(|| format!("cannot make {}", args.data.display()))?;
+        format!("sqlite:{}", args.data.join("ledger.sqlite").display())
     };
     Ledger::create(&url).await.context("cannot open the database")
 }

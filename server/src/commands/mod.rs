@@ -1,5 +1,10 @@
 //! One file per subcommand.
 
+#![allow(
+    clippy::needless_pass_by_value,
+    reason = "a command owns the arguments it was called with"
+)]
+
 pub mod demo;
 pub mod serve;
 pub mod worker;

@@ -104,12 +104,11 @@ pub(super) fn ready_machine(
 pub fn run(args: Args) -> anyhow::Result<()> {
     let expected = read_manifest(&args.manifest)?;
     let temporary;
-    let out = match &args.out {
-        Some(out) => out.clone(),
-        None => {
-            temporary = tempfile::tempdir().context("cannot make a temporary directory")?;
-            temporary.path().join("dataset")
-        }
+    let out = if let Some(out) = &args.out {
+        out.clone()
+    } else {
+        temporary = tempfile::tempdir().context("cannot make a temporary directory")?;
+        temporary.path().join("dataset")
     };
     let published = make(&args, &expected, &out)?;
     let differing = compare(&expected, &published);
@@ -176,7 +175,10 @@ fn make(args: &Args, expected: &Manifest, out: &Path) -> anyhow::Result<Publishe
         .context("cannot start the simulation threads")?;
     let sink = DirectorySink::create(out)
         .with_context(|| format!("--out {} must be absent or empty", out.display()))?;
-    let mut publisher = Publisher::new(machine.publish_spec((**spec).clone()), sink)?;
+    let mut publisher = Publisher::new(
+        machine.publish_spec((**spec).clone(), hydroflex_sim::instruction_set::level()),
+        sink,
+    )?;
     let bar = progress_bar(spec.settling_runs + spec.runs);
     for (kind, count) in [(RunKind::Settling, spec.settling_runs), (RunKind::Job, spec.runs)] {
         let mut first = 0;

@@ -193,6 +193,7 @@ fn publish_spec(
             SampleType::Float64
         },
         split: Split::default(),
+        file_size_mb: hydroflex_dataset::cut::FILE_SIZE_MB,
         lengths: RunLengths::Listed(runs.iter().map(rows).collect()),
     })
 }

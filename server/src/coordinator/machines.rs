@@ -133,9 +133,10 @@ impl CheckedMachine {
         Ok(())
     }
 
-    /// What decides the bytes of a job's data set, beside its runs.
+    /// What decides the bytes of a job's data set, beside its runs. `instruction_set` is the level that
+    /// they were simulated on.
     #[must_use]
-    pub fn publish_spec(&self, spec: JobSpec) -> PublishSpec {
+    pub fn publish_spec(&self, spec: JobSpec, instruction_set: &str) -> PublishSpec {
         // When a job's turn comes changes no byte of what it makes.
         let spec = JobSpec { priority: 0, ..spec };
         let file = self.0.machine().file();
@@ -147,7 +148,7 @@ impl CheckedMachine {
         };
         let code = CodeFacts {
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            instruction_set: hydroflex_sim::instruction_set::level().to_owned(),
+            instruction_set: instruction_set.to_owned(),
         };
         PublishSpec::of_job(spec, machine, code, self.0.simulator.channels().to_vec())
     }

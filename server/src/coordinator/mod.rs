@@ -33,7 +33,7 @@ use watch::Watch;
 const BUSY_TICK: Duration = Duration::from_millis(50);
 /// How often objects are looked for that a worker put after its job was over and cleaned up: rare, and
 /// in nobody's way.
-const SWEEP: Duration = Duration::from_secs(60);
+const SWEEP: Duration = Duration::from_mins(1);
 /// And when there is none; whoever accepts a job calls.
 const IDLE_TICK: Duration = Duration::from_millis(500);
 
@@ -253,6 +253,14 @@ impl Coordinator {
         let unfinished = self.ledger().unfinished_jobs().await?;
         let busy = !unfinished.is_empty();
         for job in unfinished {
+            if !job.is_complete() && watch.becomes_stranded(&job, &beats) {
+                tracing::warn!(
+                    job = %job.id,
+                    instruction_set = job.instruction_set,
+                    "no worker has the instruction set that this job was begun on; start one, or cancel the job \
+                     and submit it again"
+                );
+            }
             match job.state {
                 JobState::Queued | JobState::Simulating => self.advance(&job, workers).await?,
                 // Incomplete again if an object turned out damaged and its shard is done anew.

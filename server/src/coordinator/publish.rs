@@ -98,9 +98,10 @@ impl PublishFailure {
     pub fn is_permanent(&self) -> bool {
         match self {
             Self::Ledger(error) => !error.is_transient(),
-            Self::Blob(_) | Self::Scratch { .. } => false,
             // A full disk is a reason to wait, wherever it shows.
-            Self::Write(PublishError::Sink { .. } | PublishError::Parquet { .. }) => false,
+            Self::Blob(_)
+            | Self::Scratch { .. }
+            | Self::Write(PublishError::Sink { .. } | PublishError::Parquet { .. }) => false,
             _ => true,
         }
     }
@@ -178,12 +179,17 @@ async fn write(
 ) -> Result<Published, PublishFailure> {
     let (sender, receiver) = mpsc::channel(READ_AHEAD);
     let (spec, target) = (job.spec.clone(), target.to_owned());
+    // Jobs that were begun before levels were recorded ran where we run.
+    let level = job
+        .instruction_set
+        .clone()
+        .unwrap_or_else(|| hydroflex_sim::instruction_set::level().to_owned());
     let writer = tokio::task::spawn_blocking(move || {
         let sink = DirectorySink::create(&target).map_err(|source| PublishFailure::Scratch {
             path: target.clone(),
             source,
         })?;
-        let publisher = Publisher::new(machine.publish_spec(spec.clone()), sink)?;
+        let publisher = Publisher::new(machine.publish_spec(spec.clone(), &level), sink)?;
         let (published, sink) = consume(receiver, publisher, &spec, &machine)?;
         sink.commit()
             .map_err(|source| PublishFailure::Scratch { path: target, source })?;

@@ -55,7 +55,7 @@ pub async fn work(config: TrainerConfig, mut stop: watch::Receiver<bool>) -> any
     };
     let blobs = Blobs::open(&config.store)?;
     let name = identity::worker_name("trainer", 1);
-    ledger.register_worker(&name).await?;
+    ledger.register_worker(&name, None).await?;
     let heart = tokio::spawn(beat(ledger.clone(), name.clone()));
     let ended = tokio::select! {
         ended = serve(&ledger, &blobs, &config.cache, &name, stop.clone()) => ended,
@@ -89,7 +89,7 @@ async fn serve(
             }
             Ok(None) => {}
             Err(error) if error.is_transient() => {
-                tracing::warn!(%error, "the database is away; trying again")
+                tracing::warn!(%error, "the database is away; trying again");
             }
             Err(error) => return Err(error.into()),
         }

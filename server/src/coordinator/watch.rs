@@ -1,8 +1,9 @@
 //! Which workers are gone: by their beats, counted with our own monotonic clock, and, on this
 //! machine, by their process.
 
-use hydroflex_ledger::{Beat, identity};
-use std::collections::HashMap;
+use hydroflex_ledger::{Beat, JobRecord, identity};
+use hydroflex_openapi::id::JobId;
+use std::collections::{HashMap, HashSet};
 use std::time::{Duration, Instant};
 
 /// A gap between two looks counts for at most this much: if the database or this process stood still
@@ -15,6 +16,7 @@ pub struct Watch {
     lease: Duration,
     last_look: Option<Instant>,
     seen: HashMap<String, (u64, Duration)>,
+    stranded: HashSet<JobId>,
 }
 
 impl Watch {
@@ -25,6 +27,7 @@ impl Watch {
             lease,
             last_look: None,
             seen: HashMap::new(),
+            stranded: HashSet::new(),
         }
     }
 
@@ -36,7 +39,7 @@ impl Watch {
         self.last_look = Some(now);
         let mut gone = Vec::new();
         let mut seen = HashMap::with_capacity(beats.len());
-        for Beat { worker, beat } in beats {
+        for Beat { worker, beat, .. } in beats {
             let still = match self.seen.get(worker) {
                 Some((last, still)) if last == beat => *still + step.min(LONGEST_STEP),
                 _ => Duration::ZERO,
@@ -53,6 +56,25 @@ impl Watch {
         self.seen = seen;
         gone
     }
+
+    /// True if a begun job waits for workers of an instruction-set level that no worker has, while others
+    /// are there; once for each time that it comes to that.
+    pub fn becomes_stranded(&mut self, job: &JobRecord, beats: &[Beat]) -> bool {
+        let mut levels = beats
+            .iter()
+            .filter_map(|beat| beat.instruction_set.as_ref())
+            .peekable();
+        let stranded = job
+            .instruction_set
+            .as_ref()
+            .is_some_and(|needed| levels.peek().is_some() && levels.all(|level| level != needed));
+        if stranded {
+            self.stranded.insert(job.id)
+        } else {
+            self.stranded.remove(&job.id);
+            false
+        }
+    }
 }
 
 #[cfg(test)]
@@ -63,6 +85,7 @@ mod tests {
         Beat {
             worker: worker.to_owned(),
             beat,
+            instruction_set: None,
         }
     }
 
@@ -89,7 +112,7 @@ mod tests {
         let start = Instant::now();
         let mut watch = Watch::new(Duration::from_secs(3));
         assert!(watch.look(start, &[beat("a", 1)]).is_empty());
-        let an_hour_later = start + Duration::from_secs(3600);
+        let an_hour_later = start + Duration::from_hours(1);
         assert!(watch.look(an_hour_later, &[beat("a", 1)]).is_empty());
     }
 }

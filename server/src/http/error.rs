@@ -59,6 +59,7 @@ impl ApiError {
         Self::Invalid(vec![error])
     }
 
+    #[allow(clippy::too_many_lines, reason = "one line of the map after the other")]
     fn parts(self) -> (StatusCode, &'static str, &'static str, String, Vec<FieldError>) {
         match self {
             Self::Unauthorized(detail) => (

@@ -74,9 +74,9 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
     let mut pointer = String::new();
     for segment in error.path() {
         match segment {
-            Segment::Seq { index } => pointer.push_str(&format!("/{index}")),
+            Segment::Seq { index } => pointer.extend(["/", &index.to_string()]),
             Segment::Map { key } => {
-                pointer.push_str(&format!("/{}", key.replace('~', "~0").replace('/', "~1")))
+                pointer.extend(["/", &key.replace('~', "~0").replace('/', "~1")]);
             }
             Segment::Enum { .. } | Segment::Unknown => {}
         }
@@ -98,7 +98,7 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
             .pointer(&pointer)
             .is_some_and(serde_json::Value::is_object)
     {
-        pointer.push_str(&format!("/{}", name.replace('~', "~0").replace('/', "~1")));
+        pointer.extend(["/", &name.replace('~', "~0").replace('/', "~1")]);
     }
     let mut field = FieldError::new(pointer.clone(), detail);
     if let Some(value) = document.pointer(&pointer) {
@@ -177,15 +177,16 @@ impl<S: Send + Sync> FromRequestParts<S> for Page {
             .map_err(|rejection| ApiError::Malformed(rejection.body_text()))?;
         let limit = match query.limit {
             None => 50,
-            Some(text) => match text.parse() {
-                Ok(limit @ 1..=200) => limit,
-                _ => {
+            Some(text) => {
+                if let Ok(limit @ 1..=200) = text.parse() {
+                    limit
+                } else {
                     let error = FieldError::new("?limit", "not a page size")
                         .value(text)
                         .allowed("1 to 200");
                     return Err(ApiError::field(error));
                 }
-            },
+            }
         };
         Ok(Self {
             limit,

@@ -87,7 +87,7 @@ fn choose(headers: &HeaderMap, etag: &str, size: u64) -> Part {
 fn lists_etag(value: &HeaderValue, etag: &str) -> bool {
     let Ok(text) = value.to_str() else { return false };
     text.split(',')
-        .map(|tag| tag.trim())
+        .map(str::trim)
         .any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)
 }
 

@@ -2,6 +2,11 @@
 //!
 //! Deliberately absent: any request field that names a path or a URL which the service would read.
 
+#![allow(
+    clippy::missing_errors_doc,
+    reason = "the comment of a handler is its description in the OpenAPI document, which lists its errors one by one"
+)]
+
 pub mod error;
 pub mod auth;
 pub mod extract;
@@ -258,6 +263,7 @@ async fn unknown_method(method: Method, request: Request) -> ApiError {
     ApiError::MethodNotAllowed(format!("{method} is not done at {}", request.uri().path()))
 }
 
+#[allow(clippy::needless_pass_by_value, reason = "the signature is tower-http's")]
 fn panicked(cause: Box<dyn std::any::Any + Send>) -> Response {
     let text = cause
         .downcast_ref::<String>()

@@ -19,11 +19,11 @@ use tokio_util::task::TaskTracker;
 /// Connections at once; more wait in the system's queue.
 const CONNECTIONS: usize = 16_384;
 /// Time for the headers of a request, counted from the end of the one before.
-const HEADER_TIME: Duration = Duration::from_secs(60);
+const HEADER_TIME: Duration = Duration::from_mins(1);
 /// Largest head of a request.
 const HEAD_LIMIT_BYTES: usize = 64 << 10;
 /// Time for a client to take what was sent.
-const SEND_TIME: Duration = Duration::from_secs(60);
+const SEND_TIME: Duration = Duration::from_mins(1);
 /// Pause between two times that measurements are counted into their histograms: until then each takes
 /// memory, and nobody may ever ask for them.
 const UPKEEP: Duration = Duration::from_secs(5);

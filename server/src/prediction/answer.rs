@@ -15,7 +15,7 @@ impl LoadedModel {
     pub fn predict(&self, request: &PredictRequest) -> Result<PredictResponse, Vec<FieldError>> {
         let config = self.config();
         let columns = check(config, request)?;
-        let views: Vec<&[f64]> = columns.iter().map(|column| column.as_ref()).collect();
+        let views: Vec<&[f64]> = columns.iter().map(std::convert::AsRef::as_ref).collect();
         let predictor = self.predictor();
         let series = self.with_workspace(|workspace| predictor.predict_series_with(&views, workspace));
         let named = |columns: Vec<Vec<f64>>| -> BTreeMap<String, Vec<f64>> {

@@ -498,10 +498,10 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
         let flags = (!inside.is_empty()).then_some(inside.as_mut_slice());
         match &batch.samples {
             Samples::Single(values) => {
-                predictor.predict_windows_with(values, &mut estimates, flags, workspace)
+                predictor.predict_windows_with(values, &mut estimates, flags, workspace);
             }
             Samples::Double(values) => {
-                predictor.predict_windows_with(values, &mut estimates, flags, workspace)
+                predictor.predict_windows_with(values, &mut estimates, flags, workspace);
             }
         }
     });
@@ -512,8 +512,16 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
             .map(|(place, y)| y + sign * predictor.half_width(place % targets, *y).unwrap_or(f64::NAN))
             .collect()
     };
-    let lower = wants(Output::Lower).then(|| bound(-1.0)).unwrap_or_default();
-    let upper = wants(Output::Upper).then(|| bound(1.0)).unwrap_or_default();
+    let lower = if wants(Output::Lower) {
+        bound(-1.0)
+    } else {
+        Vec::new()
+    };
+    let upper = if wants(Output::Upper) {
+        bound(1.0)
+    } else {
+        Vec::new()
+    };
     let values = |output| match output {
         Output::Estimates => Values::Numbers(&estimates),
         Output::Lower => Values::Numbers(&lower),

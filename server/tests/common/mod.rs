@@ -146,6 +146,23 @@ impl Answer {
     }
 }
 
+/// What means something to one of the formats.
+const TELLING: &[&[u8]] = &[
+    b"null",
+    b"1e999",
+    b"-0",
+    b"[[[[[[[[",
+    b"{}",
+    b"\"",
+    b"\\ud800",
+    b"NaN",
+    b"18446744073709551616",
+    b",",
+    b"\0",
+    b"\xff\xff\xff\xff",
+    b"9223372036854775807",
+];
+
 /// A body with a few bytes changed, lost, doubled, moved or cut off; the same for the same seed.
 pub(crate) fn damaged(body: &[u8], seed: u64) -> Vec<u8> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
@@ -155,22 +172,6 @@ pub(crate) fn damaged(body: &[u8], seed: u64) -> Vec<u8> {
             .wrapping_add(1_442_695_040_888_963_407);
         usize::try_from(state >> 33).unwrap() % below.max(1)
     };
-    // What means something to one of the formats.
-    const TELLING: &[&[u8]] = &[
-        b"null",
-        b"1e999",
-        b"-0",
-        b"[[[[[[[[",
-        b"{}",
-        b"\"",
-        b"\\ud800",
-        b"NaN",
-        b"18446744073709551616",
-        b",",
-        b"\0",
-        b"\xff\xff\xff\xff",
-        b"9223372036854775807",
-    ];
     let mut body = body.to_vec();
     for _ in 0..=next(4) {
         let at = next(body.len());

@@ -38,7 +38,7 @@ pub(crate) async fn register_folder(ledger: &Ledger, blobs: &Blobs, path: &Path)
     };
     let job = ledger.create_job(&new, None).await.unwrap().id();
     let worker = format!("worker.{job}");
-    ledger.register_worker(&worker).await.unwrap();
+    ledger.register_worker(&worker, Some("x86-64-v3")).await.unwrap();
     let claim = ledger.begin_shard(&worker).await.unwrap().unwrap();
     let result = ShardResult {
         object: claim.object(),

@@ -49,7 +49,7 @@ pub struct Newton {
     /// What is missing of the accelerations when a step counts as solved, m/s² (√kg for modes).
     pub acceleration_tolerance: f64,
     /// Factors of one step serve the next ones of equal length, as long as they contract by at least
-    /// [`CONTRACTION_SLOW`]. Only the way to the solution differs, not the solution.
+    /// `CONTRACTION_SLOW`. Only the way to the solution differs, not the solution.
     pub keeps_factors: bool,
 }
 

@@ -30,6 +30,7 @@ pub fn validate(spec: &JobSpec, machine: &MachineFile) -> Result<(), Vec<FieldEr
     excitation(spec, machine, &mut errors);
     split(spec, &mut errors);
     let channels = channels(machine);
+    columns(spec, &channels, &mut errors);
     for (index, training) in spec.train.iter().enumerate() {
         train(spec, training, index, &channels, &mut errors);
     }
@@ -229,6 +230,31 @@ fn split(spec: &JobSpec, errors: &mut Errors) {
     );
 }
 
+fn columns(spec: &JobSpec, channels: &[Channel], errors: &mut Errors) {
+    let known: Vec<&str> = channels.iter().map(|c| c.name.as_str()).collect();
+    for (k, name) in spec.columns.iter().enumerate() {
+        let pointer = format!("/columns/{k}");
+        errors.require(
+            known.contains(&name.as_str()),
+            &pointer,
+            name,
+            format!("a channel of the machine: {}", known.join(", ")),
+        );
+        errors.require(
+            !spec.columns[..k].contains(name),
+            &pointer,
+            name,
+            "every channel once",
+        );
+    }
+    errors.require(
+        (1..=4096).contains(&spec.file_size_mb),
+        "/file_size_mb",
+        spec.file_size_mb,
+        "1 to 4096",
+    );
+}
+
 fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Channel], errors: &mut Errors) {
     let at = |field: &str| format!("/train/{index}/{field}");
     let structure = training.structure.as_str();
@@ -250,6 +276,12 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
                 &pointer,
                 name,
                 format!("a channel of the machine: {}", known.join(", ")),
+            );
+            errors.require(
+                spec.keeps(name),
+                &pointer,
+                name,
+                "a channel that the job keeps: see /columns",
             );
             errors.require(!names[..k].contains(name), &pointer, name, "every channel once");
             errors.require(

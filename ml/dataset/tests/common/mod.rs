@@ -67,7 +67,7 @@ pub(crate) fn publish_spec(job: JobSpec) -> PublishSpec {
 
 /// A sum of damped oscillations excited at random instants: about as hard to compress as the boom.
 pub(crate) fn record(kind: RunKind, run_id: u64, steps: usize) -> RunRecord {
-    let mut state = run_id.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (kind == RunKind::Settling) as u64;
+    let mut state = run_id.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ u64::from(kind == RunKind::Settling);
     let mut unit = move || {
         // splitmix64
         state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);

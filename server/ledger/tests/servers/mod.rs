@@ -16,6 +16,10 @@ pub fn free_port() -> u16 {
 
 /// Runs a shell command as soon as this process is gone, however it ends: a test process runs no
 /// destructors of statics, and none at all when it is killed.
+#[allow(
+    clippy::zombie_processes,
+    reason = "it waits for our end, so we cannot wait for its"
+)]
 fn when_we_are_gone(command: &str, folder: &Path) {
     let script = format!(
         "while kill -0 {} 2>/dev/null; do sleep 0.2; done; {command}; sleep 0.5; rm -rf '{}'",

@@ -22,6 +22,7 @@ pub fn shared() -> Option<&'static Moto> {
 
 impl Moto {
     /// Starts a server; `None` where moto is not installed.
+    #[allow(clippy::zombie_processes, reason = "it serves until this process is gone")]
     pub fn start() -> Option<Self> {
         let Some(program) = program() else {
             eprintln!("moto is not installed: its part of the suite is left out (tests/run.sh installs it)");
@@ -39,7 +40,7 @@ impl Moto {
         when_we_are_gone(&format!("kill -9 {}", process.id()), &nothing);
         let start = Instant::now();
         while TcpStream::connect(("127.0.0.1", port)).is_err() {
-            assert!(start.elapsed() < Duration::from_secs(60), "moto does not start");
+            assert!(start.elapsed() < Duration::from_mins(1), "moto does not start");
             std::thread::sleep(Duration::from_millis(50));
         }
         Some(Self { port })
@@ -66,8 +67,13 @@ impl Moto {
 
 /// The variables by which a process finds an S3 server on a port of this machine.
 pub fn environment(port: u16) -> Vec<(&'static str, String)> {
+    environment_at("127.0.0.1", port)
+}
+
+/// The same for a server of another machine.
+pub fn environment_at(host: &str, port: u16) -> Vec<(&'static str, String)> {
     vec![
-        ("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{port}")),
+        ("AWS_ENDPOINT_URL", format!("http://{host}:{port}")),
         ("AWS_REGION", "us-east-1".to_owned()),
         ("AWS_ACCESS_KEY_ID", "testing".to_owned()),
         ("AWS_SECRET_ACCESS_KEY", "testing".to_owned()),

@@ -66,6 +66,11 @@ impl Postgres {
         Some(server)
     }
 
+    /// Its port on this machine.
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
     /// URL of a new, empty database.
     pub fn database(&self, name: &str) -> String {
         // PostgreSQL cuts names at 63 bytes; ours differ before.
@@ -92,7 +97,7 @@ impl Postgres {
             match process.try_wait() {
                 Ok(None) => break,
                 _ => assert!(
-                    start.elapsed() < Duration::from_secs(60),
+                    start.elapsed() < Duration::from_mins(1),
                     "PostgreSQL does not restart"
                 ),
             }
@@ -112,7 +117,7 @@ impl Postgres {
                 return;
             }
             assert!(
-                start.elapsed() < Duration::from_secs(60),
+                start.elapsed() < Duration::from_mins(1),
                 "PostgreSQL does not start"
             );
             std::thread::sleep(Duration::from_millis(50));
