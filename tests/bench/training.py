@@ -32,7 +32,7 @@ def ours(data, scratch, structure, windows, epochs, threads, seed):
     subprocess.run(
         [HYDROFLEX, "train", "--data", data, "--out", model, "--structure", structure, "--targets", TARGET, "--window-s",
          str(WINDOW_STEPS * 0.005), "--windows", windows, "--batch", str(batch), "--learning-rate", "1e-3", "--epochs", str(epochs),
-         "--seed", str(seed), "--no-calibration"],
+         "--seed", str(seed)],
         check=True, capture_output=True, env={**os.environ, "RAYON_NUM_THREADS": str(threads)})
     return time.monotonic() - begun, json.loads((model / "config.json").read_text())
 

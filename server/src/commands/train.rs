@@ -9,7 +9,7 @@ use hydroflex_ml::evaluate::table::table;
 use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{Progress, train_dataset};
 use hydroflex_openapi::dataset::DatasetSource;
-use hydroflex_openapi::job::{NoiseLevel, NoiseSpec, TrainingSpec, WindowRule};
+use hydroflex_openapi::job::{NoiseLevel, NoiseSpec, TrainingSpec, WindowCut, WindowRule};
 use hydroflex_openapi::model::{BaselineMetrics, EvaluationReport, ModelSummary};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ops::ControlFlow;
@@ -39,6 +39,18 @@ pub struct Args {
     /// Seed of initial weights and batches
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Width of the hidden layers (default: the number of window steps)
+    #[arg(long)]
+    pub width: Option<usize>,
+    /// Which windows of a run are trained on: `overlapping`, or `disjoint` as published
+    #[arg(long, value_parser = parse_windows, default_value = "overlapping")]
+    pub windows: WindowCut,
+    /// Windows per batch
+    #[arg(long)]
+    pub batch: Option<usize>,
+    /// Adam's learning rate at the start
+    #[arg(long)]
+    pub learning_rate: Option<f64>,
     /// Largest number of epochs
     #[arg(long)]
     pub epochs: Option<usize>,
@@ -76,6 +88,10 @@ pub fn run(args: Args) -> anyhow::Result<()> {
             .window_s
             .map_or_else(WindowRule::default, |window_s| WindowRule::Given { window_s }),
         seed: args.seed,
+        width: args.width,
+        windows: args.windows,
+        batch: args.batch,
+        learning_rate: args.learning_rate,
         epochs: args.epochs,
         time_limit_s: args.time_limit_s,
         noise: args.noise,
@@ -109,6 +125,14 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         return super::print_json(&summary);
     }
     super::print_line(format_args!("{}", describe(&summary, &args.out)))
+}
+
+fn parse_windows(text: &str) -> Result<WindowCut, String> {
+    match text {
+        "overlapping" => Ok(WindowCut::Overlapping),
+        "disjoint" => Ok(WindowCut::Disjoint),
+        _ => Err("allowed are overlapping and disjoint".to_owned()),
+    }
 }
 
 /// `crane`, or `COLUMN=VALUE,COLUMN=VALUE`.

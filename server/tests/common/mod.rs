@@ -1,5 +1,6 @@
 #![allow(
     dead_code,
+    unused_imports,
     reason = "every test file is a crate of its own and uses a part of this"
 )]
 //! The whole router around a ledger and a store in a temporary directory; no workers, no sockets.
