@@ -507,6 +507,7 @@ impl Shared {
             environment: Self::environment(),
             database: Some(self.database.clone()),
             store: Some(self.store.clone()),
+            ..Start::default()
         }
     }
 
