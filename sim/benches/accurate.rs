@@ -164,7 +164,8 @@ fn errors(runs: &[&Converged], ours: &[Trajectory]) -> Vec<String> {
         .collect()
 }
 
-fn planned(simulator: &Simulator, payload_kg: f64) -> Vec<RunInput> {
+/// Random runs of a job with this payload, a number or a range.
+fn planned(simulator: &Simulator, payload_kg: &serde_json::Value) -> Vec<RunInput> {
     let spec: JobSpec = serde_json::from_value(serde_json::json!({
         "runs": RUNS, "seed": 7, "payload_kg": payload_kg,
     }))
@@ -198,7 +199,7 @@ fn measure(simulator: &Simulator, payload_kg: f64, converged: &[Converged]) -> C
         .filter(|r| (r.input.payload_kg - payload_kg).abs() < 0.5)
         .collect();
     let inputs: Vec<RunInput> = if known.is_empty() {
-        planned(simulator, payload_kg)
+        planned(simulator, &serde_json::json!(payload_kg))
     } else {
         let mut endless = known.iter().cycle();
         (0..RUNS)
@@ -319,5 +320,22 @@ fn main() {
         if !cost.errors.is_empty() {
             println!("        largest error: {}", cost.errors.join(", "));
         }
+    }
+    if !json {
+        // A payload of its own for every run: the modes are found anew for each.
+        let inputs = planned(&simulator, &serde_json::json!({ "min": 1.0, "max": 100.0 }));
+        let body = &simulator.reduced(true).expect("the body reduces")[0];
+        let model = PlanarModel::new(simulator.machine().file(), body, true).expect("the machine is planar");
+        let mut ws = Workspace::default();
+        let batch = best_us(inputs.len(), || {
+            std::hint::black_box(&model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
+        });
+        let alone = best_us(inputs.len(), || {
+            for input in &inputs {
+                let run = model.run(input, SAMPLE_S, TOLERANCE, &mut Workspace::default());
+                std::hint::black_box(&run);
+            }
+        });
+        println!("1 to 100 kg: alone {alone:.0}; batch {batch:.0}");
     }
 }

@@ -52,65 +52,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let body = &simulator.reduced(payload_kg > 0.0)?[0];
         let model = PlanarModel::new(simulator.machine().file(), body, payload_kg > 0.0)?;
         let mut ws = Workspace::default();
-        if let Ok(reps) = std::env::var("TIME") {
-            let mut best = f64::INFINITY;
-            for _ in 0..reps.parse::<usize>()? {
-                let now = || {
-                    let u =
-                        nix::sys::resource::getrusage(nix::sys::resource::UsageWho::RUSAGE_THREAD).unwrap();
-                    use nix::sys::time::TimeValLike;
-                    (u.user_time().num_microseconds() + u.system_time().num_microseconds()) as f64
-                };
-                std::thread::yield_now();
-                let t = now();
-                std::hint::black_box(model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
-                best = best.min((now() - t) / inputs.len() as f64);
-            }
-            println!("{machine} {payload_kg} kg: {best:.1} us");
-            continue;
-        }
         let ours = finished(model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
-        let stem = std::path::Path::new(machine)
-            .file_stem()
-            .unwrap()
-            .to_string_lossy()
-            .into_owned();
-        let store = format!("/tmp/conv-{stem}-{payload_kg}-{seed}-{runs}.bin");
-        let converged: Vec<Option<Trajectory>> = if let Ok(bytes) = std::fs::read(&store) {
-            let mut it = bytes
-                .chunks_exact(8)
-                .map(|b| f64::from_le_bytes(b.try_into().unwrap()));
-            let k = simulator.channels().len();
-            (0..inputs.len())
-                .map(|_| {
-                    let columns: Vec<Vec<f64>> = (0..k)
-                        .map(|_| (0..201).map(|_| it.next().unwrap()).collect())
-                        .collect();
-                    Some(Trajectory {
-                        sample_count: 201,
-                        columns,
-                        flags: vec![],
-                        statistics: Default::default(),
-                    })
-                })
-                .collect()
-        } else {
-            let c = finished(model.run_batch(&inputs, SAMPLE_S, CONVERGED, &mut ws));
-            let bytes: Vec<u8> = c
-                .iter()
-                .flat_map(|r| {
-                    r.as_ref()
-                        .unwrap()
-                        .columns
-                        .iter()
-                        .flatten()
-                        .flat_map(|x| x.to_le_bytes())
-                        .collect::<Vec<u8>>()
-                })
-                .collect();
-            std::fs::write(&store, bytes).unwrap();
-            c
-        };
+        let converged = finished(model.run_batch(&inputs, SAMPLE_S, CONVERGED, &mut ws));
         let count = ours.len().max(1) as f64;
         let mean =
             |of: &dyn Fn(&Trajectory) -> u64| ours.iter().flatten().map(of).sum::<u64>() as f64 / count;
@@ -121,28 +64,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             mean(&|run| run.statistics.rejected),
             mean(&|run| run.statistics.factorisations),
         );
-        if let Ok(d) = std::env::var("DUMP") {
-            for d in d.split(',') {
-                let d: usize = d.parse()?;
-                let (a, b) = (ours[d].as_ref().unwrap(), converged[d].as_ref().unwrap());
-                println!("run {d}");
-                for i in 0..a.sample_count {
-                    println!(
-                        "{:.3} U {:7.4} v {:9.5} p1 {:8.4} ({:8.1e}) p2 {:8.4} ({:8.1e}) al {:8.4} ({:8.1e})",
-                        i as f64 * SAMPLE_S,
-                        b.columns[0][i],
-                        b.columns[2][i],
-                        b.columns[3][i] / 1e6,
-                        (a.columns[3][i] - b.columns[3][i]) / 1e6,
-                        b.columns[4][i] / 1e6,
-                        (a.columns[4][i] - b.columns[4][i]) / 1e6,
-                        b.columns[8][i],
-                        a.columns[8][i] - b.columns[8][i]
-                    );
-                }
-            }
-            continue;
-        }
         println!("  against tolerance {CONVERGED:e}:");
         let scales = report(&simulator, &inputs, &ours, &converged, worst, None);
         if let Some((few, step_s)) = second {
@@ -255,22 +176,6 @@ fn report(
                 )
             })
             .collect();
-        if std::env::var("BRIEF").is_ok() {
-            print!(
-                "{} {:.1e}/{:.1e}/{:.1e}@{}; ",
-                channel
-                    .name
-                    .replace("lift_", "")
-                    .chars()
-                    .take(18)
-                    .collect::<String>(),
-                quantile(0.5),
-                quantile(0.95),
-                errors[0].0,
-                errors[0].1
-            );
-            continue;
-        }
         println!(
             "    {:32} median {:.1e}, 95 % {:.1e}, largest {}",
             channel.name,
@@ -279,6 +184,5 @@ fn report(
             places.join("; ")
         );
     }
-    println!();
     taken
 }

@@ -11,7 +11,7 @@ use super::statics::rest;
 use super::step::{StepBuffer, step};
 use super::sums::sums;
 use super::tableau::{RODAS5P, Tableau};
-use super::track::{Outcome, Track, Verdict};
+use super::track::{LINE_CAUTION, Outcome, Track, Verdict};
 use crate::simulator::SimulatorError;
 use crate::trajectory::{RunFailure, RunInput, Trajectory};
 
@@ -30,6 +30,8 @@ pub(super) struct Common {
     pub(super) tolerance: f64,
     /// Reciprocal squared local tolerance.
     pub(super) per_tolerance2: f64,
+    /// Squared part of the usual error that is accepted where oil meets its line, as a reciprocal.
+    pub(super) line_caution2: f64,
     /// Method.
     pub(super) method: &'static Tableau,
 }
@@ -40,10 +42,12 @@ impl Common {
     /// is measured on the published boom (`sim/theory/minimal_coordinates.md`, §6).
     pub(super) fn new(sample_time_s: f64, tolerance: f64) -> Self {
         let local = (400.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
+        let caution = LINE_CAUTION.min(local / LEAST_LOCAL);
         Self {
             sample_time_s,
             tolerance,
             per_tolerance2: 1.0 / (local * local),
+            line_caution2: caution * caution,
             method: &RODAS5P,
         }
     }
@@ -197,6 +201,7 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
                             job,
                             &inputs[job],
                             common.sample_time_s,
+                            common.line_caution2,
                             channels,
                             start.length_m,
                             cylinder,
@@ -228,7 +233,7 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
             return;
         }
         let Some(c) = bodies.constants() else { return };
-        let c = std::hint::black_box(c);
+        let c = if L::WIDTH > 1 { std::hint::black_box(c) } else { c };
         step(c, common.method, &state, step_s, &regime, buffer);
         if recording {
             read(c, &state, &buffer.start, &mut readings);

@@ -69,7 +69,7 @@ pub(super) fn step<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, c
     for stage in 0..method.stages {
         // Otherwise the compiler broadcasts all constants once, before the loop over the steps, and keeps the
         // hundreds of packs on the stack, where they drive the state out of the first-level cache.
-        let c = std::hint::black_box(c);
+        let c = if L::WIDTH > 1 { std::hint::black_box(c) } else { c };
         gather(c, method, stage, y, inverse_h, w);
         let at = if stage == 0 {
             &w.start

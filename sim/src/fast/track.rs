@@ -15,7 +15,7 @@ const SHORTEST_S: f64 = 1e-9;
 /// error only: the flow's slope has no bound at equal pressures, and the estimate, which comes from the
 /// same stages, sees little of it. The same where a step crosses the line.
 const LINE_BAND: f64 = 0.03;
-const LINE_CAUTION: f64 = 12.0;
+pub(super) const LINE_CAUTION: f64 = 12.0;
 /// Friction turns over within its transition velocity, often within one step, and its force is too
 /// small for the error estimate to see; the acceleration at the end of the step sees it. So the last step
 /// before a sample may change the speed by at most this many transition velocities …
@@ -38,6 +38,7 @@ pub(super) struct Track<'a> {
     pub(super) job: usize,
     input: &'a RunInput,
     sample_time_s: f64,
+    line_caution2: f64,
     /// Samples reached.
     sample: usize,
     /// A sample waits to be recorded with the rates at the start of the coming step.
@@ -96,6 +97,7 @@ impl<'a> Track<'a> {
         job: usize,
         input: &'a RunInput,
         sample_time_s: f64,
+        line_caution2: f64,
         channels: usize,
         length_m: f64,
         cylinder: &Cylinder,
@@ -105,6 +107,7 @@ impl<'a> Track<'a> {
             job,
             input,
             sample_time_s,
+            line_caution2,
             sample: 0,
             record_due: true,
             piece: Piece {
@@ -200,7 +203,7 @@ impl<'a> Track<'a> {
         self.attempts += 1;
         self.statistics.factorisations += 1;
         let error2 = if self.meets_line(outcome, cylinder) {
-            outcome.error2 * (LINE_CAUTION * LINE_CAUTION)
+            outcome.error2 * self.line_caution2
         } else {
             outcome.error2
         };
