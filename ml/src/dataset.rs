@@ -14,13 +14,15 @@ const VALIDATION_STRIDE: usize = 5;
 
 /// Loads what `spec` needs, and fills in its channels and its window.
 ///
-/// Runs with a flag that the data set's job excludes are left out.
+/// Runs with a flag that the data set's job excludes are left out. The validation runs without any flag calibrate
+/// intervals and envelope, and so do those of `calibration`.
 ///
 /// # Errors
 /// A channel is not there, a file is damaged, or the window cannot be told.
 pub fn training_data(
     dataset: &Dataset,
     spec: &TrainingSpec,
+    calibration: Option<&Runs>,
 ) -> Result<(TrainingData, TrainingSpec), TrainError> {
     let mut spec = spec.clone();
     if spec.inputs.is_empty() {
@@ -51,11 +53,22 @@ pub fn training_data(
             }
         }
     }
+    let calm = |run: &&RunSamples| dataset.run(run.run_id).is_none_or(|row| row.flags.is_empty());
+    let short = Runs {
+        channels: validation.channels.clone(),
+        sample_time_s: validation.sample_time_s,
+        runs: validation.runs.iter().filter(calm).cloned().collect(),
+    };
+    let mut calibrating = vec![short];
+    if let Some(long) = calibration {
+        calibrating.push(long.select(&names)?);
+    }
     let dataset_sha256 = dataset.dataset_sha256().to_owned();
     Ok((
         TrainingData {
             train,
             validation,
+            calibration: calibrating,
             dataset_sha256,
         },
         spec,

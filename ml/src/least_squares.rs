@@ -118,6 +118,16 @@ impl WindowMoments {
         }
     }
 
+    /// Adds the covariance of noise in the windows, independent of the windows and the targets.
+    pub fn add_noise(&mut self, covariance: &Mat<f64>) {
+        let size = self.mean.len();
+        for j in 0..size {
+            for i in j..size {
+                self.covariance[(i, j)] += covariance[(i, j)];
+            }
+        }
+    }
+
     /// Mean squared error of `map` for each target on these windows.
     #[must_use]
     pub fn mean_squared_error(&self, map: &LinearMap) -> Vec<f64> {

@@ -12,6 +12,7 @@
 //! * [`structure`], [`network`]: what can be trained; the letters are the paper's.
 //! * [`least_squares`]: the best linear map of a window, a baseline; [`scheduled`]: the same with
 //!   coefficients that follow the machine's pose, the skip connection of our network.
+//! * [`envelope`]: what tells a window unlike the training's; [`noise`]: sensor noise to train and judge with.
 //! * [`train`]: the training loop on burn tensors, with checkpoints.
 //! * [`model`]: the model folder; [`predict`]: estimates without the tensor framework.
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
@@ -33,6 +34,8 @@ pub mod scaling;
 pub mod structure;
 pub mod least_squares;
 pub mod scheduled;
+pub mod envelope;
+pub mod noise;
 pub mod network;
 pub mod train;
 pub mod model;

@@ -95,7 +95,9 @@ struct Term {
 
 impl ScheduledMap {
     /// Fits to `train`, chooses degree and ridge by `judge`. `scheduling` are the positions of the slow
-    /// signals among the inputs; without any the map is linear.
+    /// signals among the inputs; without any the map is linear. `noise` is the covariance of what disturbs the windows
+    /// of `train`, which are clean: the fit is that of infinitely many disturbed copies. Those of `judge` are disturbed
+    /// already. (What the noise does to the slow signals themselves is left out: it is far below their range.)
     ///
     /// # Errors
     /// The inputs are not finite or constant.
@@ -104,6 +106,7 @@ impl ScheduledMap {
         judge: Sample<'_>,
         scaling: &Scaling,
         scheduling: &[usize],
+        noise: Option<&Mat<f64>>,
     ) -> Result<Self, NormalEquationsError> {
         let schedule = ranges(train.series, scaling, scheduling);
         let steps = train.windows.steps;
@@ -113,7 +116,7 @@ impl ScheduledMap {
             exponents,
             ..schedule
         };
-        let normal = Normal::gather(&train, scaling, &schedule, &terms);
+        let normal = Normal::gather(&train, scaling, &schedule, &terms, noise);
         let candidates = normal.candidates();
         let errors = normal.errors(&candidates, &judge, scaling, &schedule);
         let best = errors
@@ -279,7 +282,13 @@ struct Candidate {
 }
 
 impl<'a> Normal<'a> {
-    fn gather(train: &Sample<'_>, scaling: &Scaling, schedule: &Schedule, terms: &'a [Term]) -> Self {
+    fn gather(
+        train: &Sample<'_>,
+        scaling: &Scaling,
+        schedule: &Schedule,
+        terms: &'a [Term],
+        noise: Option<&Mat<f64>>,
+    ) -> Self {
         let size = train.windows.steps * train.series.width;
         let mut sums: BTreeMap<Vec<u32>, Mat<f64>> = BTreeMap::new();
         for a in terms {
@@ -300,6 +309,17 @@ impl<'a> Normal<'a> {
                 .par_iter_mut()
                 .zip(terms)
                 .for_each(|(sum, term)| gathered.add_cross(&term.exponents, sum));
+        }
+        if let Some(noise) = noise {
+            // E[m mʹ (x + n)(x + n)ᵀ] = E[m mʹ x xᵀ] + E[m mʹ] E[n nᵀ]; the first entry is the sum of m mʹ.
+            for sum in sums.values_mut() {
+                let weight = sum[(0, 0)];
+                for j in 0..size {
+                    for i in j..size {
+                        sum[(1 + i, 1 + j)] += weight * noise[(i, j)];
+                    }
+                }
+            }
         }
         let unknowns = terms.last().map_or(0, |t| t.offset + size - t.first + 1);
         let count = chosen.len() as f64;
@@ -696,7 +716,7 @@ mod tests {
         };
         let train = case(1, law);
         let fit = |scheduling: &[usize]| {
-            ScheduledMap::fit(sample(&train), sample(&train), &train.scaling, scheduling).unwrap()
+            ScheduledMap::fit(sample(&train), sample(&train), &train.scaling, scheduling, None).unwrap()
         };
         let map = fit(&[0]);
         assert!(map.schedule.exponents.len() >= 3, "{:?}", map.schedule.exponents);

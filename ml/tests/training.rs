@@ -5,12 +5,14 @@
 
 #![allow(clippy::unwrap_used, reason = "tests")]
 
+use hydroflex_ml::evaluate;
 use hydroflex_ml::model::Model;
+use hydroflex_ml::predict::Predictor;
 use hydroflex_ml::runs::{RunSamples, Runs};
 use hydroflex_ml::train::prepare::TrainingData;
 use hydroflex_ml::train::{Progress, TrainError, train};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
-use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
+use hydroflex_openapi::job::{NoiseSpec, TrainingSpec, WindowCut, WindowRule};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -63,6 +65,7 @@ fn data() -> TrainingData {
     TrainingData {
         train: oscillators(16, 0),
         validation: oscillators(4, 100),
+        calibration: vec![oscillators(4, 100)],
         dataset_sha256: "0".repeat(64),
     }
 }
@@ -169,6 +172,100 @@ fn our_network_beats_least_squares_and_its_folder_predicts_the_same() {
         // Another blocking sums in the same order, so these agree to f32 rounding of 1e-3 m.
         assert!((single[0] - series.columns[0][w]).abs() < 1e-9 && (batch[w] - single[0]).abs() < 1e-9);
     }
+}
+
+#[test]
+fn bounds_leave_known_signals_alone_and_hold_unknown_ones() {
+    let folder = Folder::new("bounds");
+    run(&spec("best", 60), &folder.0, "model").unwrap();
+    let model = Model::load(&folder.0.join("model")).unwrap();
+    let predictor = model.predictor();
+    let mut free = model.config().clone();
+    let guard = free.guard.take().unwrap();
+    let unbounded = Predictor::new(&free, model.weights(), model.auxiliary());
+    for run in data().train.runs.iter().chain(&oscillators(5, 1000).runs) {
+        let columns: Vec<&[f64]> = run.columns[..2].iter().map(Vec::as_slice).collect();
+        assert_eq!(
+            predictor.predict_series(&columns).columns,
+            unbounded.predict_series(&columns).columns
+        );
+    }
+    // With hardly any slack the bounds are reached, and every limited estimate is flagged.
+    let mut narrow = model.config().clone();
+    narrow.guard = Some(hydroflex_openapi::model::Guard {
+        slack: guard.slack.iter().map(|s| 1e-3 * s).collect(),
+        ..guard
+    });
+    let narrow = Predictor::new(&narrow, model.weights(), model.auxiliary());
+    let run = oscillators(1, 2000).runs.remove(0);
+    let columns: Vec<&[f64]> = run.columns[..2].iter().map(Vec::as_slice).collect();
+    let (free, limited) = (
+        predictor.predict_series(&columns),
+        narrow.predict_series(&columns),
+    );
+    let changed = |k: &usize| free.columns[0][*k].to_bits() != limited.columns[0][*k].to_bits();
+    assert!((0..free.inside.len()).filter(changed).all(|k| !limited.inside[k]));
+    assert!((0..free.inside.len()).filter(changed).count() > free.inside.len() / 2);
+}
+
+#[test]
+fn a_network_trained_for_noise_is_better_under_noise_and_resumes_to_the_same_bytes() {
+    let folder = Folder::new("noise");
+    let stds = [
+        ("valve_lift_ratio".to_owned(), 0.05),
+        ("length_lift_m".to_owned(), 2e-3),
+    ];
+    let noise = NoiseSpec::Channels(stds.into());
+    let trained_for = TrainingSpec {
+        noise: Some(noise),
+        ..spec("best", 60)
+    };
+    run(&spec("best", 60), &folder.0, "clean").unwrap();
+    run(&trained_for, &folder.0, "noisy").unwrap();
+    let [clean, noisy] = ["clean", "noisy"].map(|name| Model::load(&folder.0.join(name)).unwrap());
+    let unseen = evaluate::with_noise_of_training(&noisy, &oscillators(10, 1000), 1).unwrap();
+    let mae = |model| evaluate::evaluate(model, &unseen, "").unwrap().report.targets[0].mae;
+    assert!(
+        mae(&noisy) < 0.7 * mae(&clean),
+        "{:e} {:e}",
+        mae(&noisy),
+        mae(&clean)
+    );
+    let report = evaluate::evaluate(&noisy, &unseen, "").unwrap().report;
+    // Four runs calibrate and ten judge: a coarse check that noise is in the intervals.
+    assert!(
+        (0.8..0.97).contains(&report.targets[0].coverage.unwrap()),
+        "{report:?}"
+    );
+    let mut stop = |progress: Progress| {
+        if progress.epoch >= 20 {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
+    };
+    let checkpoint = folder.0.join("checkpoint");
+    train(
+        &data(),
+        &trained_for,
+        &mut stop,
+        &checkpoint,
+        &folder.0.join("resumed"),
+    )
+    .unwrap_err();
+    run(&trained_for, &folder.0, "resumed").unwrap();
+    assert_eq!(folder.files("noisy"), folder.files("resumed"));
+    let wrong = TrainingSpec {
+        noise: Some(NoiseSpec::Channels(
+            [("deflection_tip_y_m".to_owned(), 1.0)].into(),
+        )),
+        ..spec("best", 1)
+    };
+    let error = run(&wrong, &folder.0, "wrong").unwrap_err().to_string();
+    assert!(
+        error.contains("deflection_tip_y_m") && error.contains("no input"),
+        "{error}"
+    );
 }
 
 #[test]

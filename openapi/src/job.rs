@@ -354,6 +354,29 @@ pub struct TrainingSpec {
     /// All overlapping windows (default), or the disjoint ones of the published scripts.
     #[serde(default)]
     pub windows: WindowCut,
+    /// Sensor noise that is added to the inputs, in training and calibration; absent: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub noise: Option<NoiseSpec>,
+}
+
+/// Sensor noise: a level by name, or standard deviations of the inputs by column, in their units; columns that are
+/// not named are free of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum NoiseSpec {
+    /// Measured on a machine.
+    Level(NoiseLevel),
+    /// White noise, standard deviations by column.
+    Channels(BTreeMap<String, f64>),
+}
+
+/// Named levels of sensor noise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseLevel {
+    /// As measured on a crane at rest: lengths 0.49 mm, pressures 11.7 kPa, angles 0.32°, valve commands one bit of
+    /// twelve; velocities are differentiated from the noisy length.
+    Crane,
 }
 
 fn default_structure() -> String {
@@ -374,6 +397,7 @@ impl Default for TrainingSpec {
             learning_rate: None,
             batch: None,
             windows: WindowCut::default(),
+            noise: None,
         }
     }
 }

@@ -38,6 +38,9 @@ pub struct ModelConfig {
     /// the model: far outside its training data a polynomial says nothing, and says it loudly. Absent: not held.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub input_limits: Vec<[f64; 2]>,
+    /// Bounds of the estimates; absent in models of earlier versions, whose estimates are not bounded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub guard: Option<Guard>,
     /// Layers of the network (`net.*`), first to last; empty when the skip is the whole model.
     pub layers: Vec<DenseLayer>,
     /// Where the model comes from.
@@ -91,6 +94,27 @@ pub struct Schedule {
     pub exponents: Vec<Vec<u32>>,
 }
 
+/// Bounds of the estimates, one value per target, in its column's unit:
+///
+/// ```text
+/// guide = guard.weight · scaled window + guard.bias        (unscaled; tensors of `model.safetensors`)
+/// estimate = clamp(clamp(model, guide − slack, guide + slack), min, max)
+/// ```
+///
+/// The guide is a linear map with small coefficients, which cannot be far off when the window is unlike all training
+/// windows; the model's large coefficients can. On the training runs no estimate is changed. Where one is, the window is
+/// outside the envelope.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Guard {
+    /// Largest distance of an estimate from the guide.
+    pub slack: Vec<f64>,
+    /// Smallest estimate.
+    pub min: Vec<f64>,
+    /// Largest estimate.
+    pub max: Vec<f64>,
+}
+
 /// `output = activation(weight · input + bias)`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -133,6 +157,12 @@ pub struct ModelProvenance {
     pub train_runs: usize,
     /// Validation runs used.
     pub validation_runs: usize,
+    /// Windows on which intervals and envelope were calibrated: of runs without a flag that were not trained on.
+    #[serde(default)]
+    pub calibration_windows: usize,
+    /// Longest of these runs.
+    #[serde(default)]
+    pub calibration_s: f64,
     /// Training windows in an epoch.
     pub train_windows: usize,
     /// Epochs done.
@@ -211,6 +241,12 @@ pub struct TargetMetrics {
     /// Part of the samples inside the 90 % interval, where the model has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub coverage: Option<f64>,
+    /// The same in thirds of the samples by the size of the reference: its distance from the target's training mean.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub coverage_thirds: Option<[f64; 3]>,
+    /// Mean width of the intervals.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub interval_width: Option<f64>,
 }
 
 /// 90 % intervals by conformal prediction, in classes of the estimate's distance from the target's
@@ -322,4 +358,19 @@ pub struct BaselineMetrics {
     pub name: String,
     /// One per target.
     pub targets: Vec<TargetMetrics>,
+}
+
+/// How often the envelope flags a fault of the sensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FaultRate {
+    /// What is wrong.
+    pub fault: String,
+    /// Windows in which it can be known.
+    pub windows: u64,
+    /// Part of them that are flagged.
+    pub flagged: f64,
+    /// Cases with such windows.
+    pub cases: u64,
+    /// Part of them with a flag.
+    pub found: f64,
 }

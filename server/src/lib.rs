@@ -8,6 +8,7 @@
     )
 )]
 
+pub mod calibration;
 pub mod http;
 pub mod coordinator;
 pub mod prediction;

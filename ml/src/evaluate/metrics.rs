@@ -43,6 +43,8 @@ pub fn metrics(target: &str, unit: &str, estimate: &[f64], reference: &[f64]) ->
         mae_relative_to_range: if range > 0.0 { mae / range } else { 0.0 },
         r2: if spread > 0.0 { 1.0 - squares / spread } else { 0.0 },
         coverage: None,
+        coverage_thirds: None,
+        interval_width: None,
     }
 }
 

@@ -3,14 +3,19 @@
 pub mod metrics;
 pub mod intervals;
 pub mod table;
+pub mod faults;
 
 use crate::model::Model;
 use crate::model::weights::LinearWeights;
+use crate::noise::Noise;
 use crate::runs::{Runs, RunsError};
 use crate::scaling::Scaling;
 use crate::window::WindowError;
 use hydroflex_openapi::model::{BaselineMetrics, EvaluationReport, TargetMetrics};
 use metrics::metrics;
+
+/// Stream of the noise of evaluations; trainings use others.
+const EVALUATION_STREAM: u64 = 1 << 40;
 
 /// Two sample times are the same within this relative difference.
 const SAMPLE_TIME_TOLERANCE: f64 = 1e-6;
@@ -24,6 +29,9 @@ pub enum EvaluateError {
     /// No run is as long as a window.
     #[error(transparent)]
     Window(#[from] WindowError),
+    /// Noise that does not fit the model.
+    #[error(transparent)]
+    Noise(#[from] crate::noise::NoiseError),
     /// Another time between samples.
     #[error("the model was trained with {model_s} s between samples, the data have {data_s} s")]
     SampleTime {
@@ -161,16 +169,15 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
     let mut of_model = judge(&all.estimate);
     if predictor.has_intervals() {
         for (t, metrics) in of_model.iter_mut().enumerate() {
-            let covered = all.estimate[t]
-                .iter()
-                .zip(&all.reference[t])
-                .filter(|&(&e, &r)| {
-                    predictor
-                        .half_width(t, e)
-                        .is_some_and(|half| (e - r).abs() <= half)
-                })
-                .count();
-            metrics.coverage = Some(covered as f64 / all.reference[t].len() as f64);
+            let coverage = coverage(
+                &all.estimate[t],
+                &all.reference[t],
+                config.targets[t].offset,
+                |estimate| predictor.half_width(t, estimate).unwrap_or(0.0),
+            );
+            metrics.coverage = Some(coverage.all);
+            metrics.coverage_thirds = Some(coverage.thirds);
+            metrics.interval_width = Some(coverage.width);
         }
     }
     let report = EvaluationReport {
@@ -194,6 +201,60 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         report,
         runs: evaluated,
     })
+}
+
+struct Coverage {
+    all: f64,
+    thirds: [f64; 3],
+    width: f64,
+}
+
+/// Part of the reference values within the half width of their estimates, all and by thirds of their distance from
+/// `centre`, and the mean width.
+fn coverage(estimate: &[f64], reference: &[f64], centre: f64, half_width: impl Fn(f64) -> f64) -> Coverage {
+    let mut width = 0.0;
+    let mut samples: Vec<(f64, bool)> = estimate
+        .iter()
+        .zip(reference)
+        .map(|(&e, &r)| {
+            let half = half_width(e);
+            width += 2.0 * half;
+            ((r - centre).abs(), (e - r).abs() <= half)
+        })
+        .collect();
+    samples.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let part = |some: &[(f64, bool)]| {
+        some.iter().filter(|sample| sample.1).count() as f64 / some.len().max(1) as f64
+    };
+    let count = samples.len();
+    Coverage {
+        all: part(&samples),
+        thirds: std::array::from_fn(|third| part(&samples[third * count / 3..(third + 1) * count / 3])),
+        width: width / count.max(1) as f64,
+    }
+}
+
+/// `runs` with the noise that the model was trained with on its inputs, other noise than in training; unchanged for
+/// a model that was trained without.
+///
+/// # Errors
+/// A channel is missing.
+pub fn with_noise_of_training(model: &Model, runs: &Runs, seed: u64) -> Result<Runs, EvaluateError> {
+    let config = model.config();
+    let Some(spec) = &config.provenance.spec.noise else {
+        return Ok(runs.clone());
+    };
+    let names: Vec<String> = config.inputs.iter().map(|c| c.name.clone()).collect();
+    let positions = runs.positions(&names)?;
+    let inputs = runs.select(&names)?;
+    let noisy = Noise::new(spec, &inputs.channels, runs.sample_time_s)?.add(&inputs, seed, EVALUATION_STREAM);
+    let mut disturbed = runs.clone();
+    for (run, noisy) in disturbed.runs.iter_mut().zip(noisy.runs) {
+        for (&position, column) in positions.iter().zip(noisy.columns) {
+            run.columns[position] = column;
+        }
+    }
+    Ok(disturbed)
 }
 
 struct Columns {

@@ -84,11 +84,18 @@ fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
         provenance.hydroflex_version, provenance.burn_version
     )?;
     writeln!(text, "## Limits\n")?;
+    let noise = if provenance.spec.noise.is_some() {
+        "with the sensor noise named in `config.json`"
+    } else {
+        "without noise"
+    };
     writeln!(
         text,
-        "Trained on simulated signals without noise, of one machine and the payloads of its data set. Inputs outside \
-         the envelope in `config.json` are flagged, not refused. Intervals are meant to hold the true value 9 times \
-         out of 10 for signals like those of the data set."
+        "Trained on simulated signals {noise}, of one machine and the payloads of its data set. Inputs outside \
+         the envelope in `config.json` are flagged, not refused, and estimates are held near a tame linear map. Intervals are \
+         meant to hold the true value 9 times out of 10; they and the envelope were calibrated on {} windows of runs of up to \
+         {:.1} s that were not trained on, without end stops or cavitation.",
+        provenance.calibration_windows, provenance.calibration_s
     )
 }
 

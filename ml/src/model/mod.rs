@@ -3,7 +3,7 @@
 //! | file | content |
 //! |---|---|
 //! | `config.json` | [`ModelConfig`]: window, channels, scales, layers, metrics, provenance, golden predictions |
-//! | `model.safetensors` | `net.N.weight`, `net.N.bias`, `skip.weight`, `skip.bias` (f64), as PyTorch has them |
+//! | `model.safetensors` | `net.N.weight`, `net.N.bias`, `skip.weight`, `skip.bias` (f64), `guard.weight`, `guard.bias`, as PyTorch has them |
 //! | `auxiliary.safetensors` | linear baselines, envelope |
 //! | `model.onnx` | the same network with the scales in its graph |
 //! | `README.md` | model card |
@@ -279,6 +279,18 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
     {
         return Err(inconsistent(
             "input limits must be finite and ordered, one pair per input",
+        ));
+    }
+    if config.guard.as_ref().is_some_and(|guard| {
+        let count = config.targets.len();
+        guard.slack.len() != count
+            || guard.min.len() != count
+            || guard.max.len() != count
+            || guard.slack.iter().any(|s| !(s.is_finite() && *s >= 0.0))
+            || guard.min.iter().zip(&guard.max).any(|(min, max)| !(min <= max))
+    }) {
+        return Err(inconsistent(
+            "the bounds of the estimates must be ordered, one set per target",
         ));
     }
     let scales = config.inputs.iter().chain(&config.targets);

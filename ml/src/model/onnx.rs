@@ -5,11 +5,13 @@
 //!                                                    └► f64 skip, times powers of the slow signals ─┘
 //! ```
 //!
+//! and between the sum and the unscaling the bounds: `Max`, `Min` with the guide's output and the target's range.
+//!
 //! Only the messages and fields that this graph needs are declared, with the numbers of
 //! `onnx.proto` (IR version 8, operator set 17).
 
 use super::weights::{LinearWeights, SkipWeights, Weights};
-use hydroflex_openapi::model::{Activation, ModelConfig, ScaledChannel, Schedule};
+use hydroflex_openapi::model::{Activation, Guard, ModelConfig, ScaledChannel, Schedule};
 use prost::Message;
 
 const IR_VERSION: i64 = 8;
@@ -148,6 +150,7 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
     let window_values = config.window_steps * config.inputs.len();
     let flat = graph.scale_inputs(config, window_values);
     let mut x = graph.cast(&flat, FLOAT);
+    let window = x.clone();
     // The skip computes in f64 with what the network sees, as in training.
     let rounded = graph.cast(&x, DOUBLE);
     for (layer, map) in config.layers.iter().zip(&weights.layers) {
@@ -164,6 +167,9 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
         } else {
             graph.node("Add", &[&x, &linear], Vec::new())
         };
+    }
+    if let Some((guard, guide)) = config.guard.as_ref().zip(weights.guard.as_ref()) {
+        x = graph.limit(guard, guide, &config.targets, &window, &x);
     }
     graph.unscale_outputs(&config.targets, &x);
     let names = |channels: &[ScaledChannel]| {
@@ -342,6 +348,33 @@ impl Graph {
                 self.node("Min", &[&above, &one], Vec::new())
             })
             .collect()
+    }
+
+    /// Scaled estimates within the guard's bounds.
+    fn limit(
+        &mut self,
+        guard: &Guard,
+        guide: &LinearWeights,
+        targets: &[ScaledChannel],
+        window: &str,
+        x: &str,
+    ) -> String {
+        let guide = self.gemm("guard", window, guide);
+        let guide = self.cast(&guide, DOUBLE);
+        let scaled = |values: &[f64]| -> Vec<f64> {
+            let value = |(v, c): (&f64, &ScaledChannel)| (v - c.offset) / c.scale;
+            values.iter().zip(targets).map(value).collect()
+        };
+        let slack = guard.slack.iter().zip(targets).map(|(s, c)| s / c.scale);
+        let slack = self.doubles("guard_slack", slack);
+        let low = self.node("Sub", &[&guide, &slack], Vec::new());
+        let high = self.node("Add", &[&guide, &slack], Vec::new());
+        let min = self.doubles("guard_min", scaled(&guard.min).into_iter());
+        let max = self.doubles("guard_max", scaled(&guard.max).into_iter());
+        let above = self.node("Max", &[x, &low], Vec::new());
+        let near = self.node("Min", &[&above, &high], Vec::new());
+        let above = self.node("Max", &[&near, &min], Vec::new());
+        self.node("Min", &[&above, &max], Vec::new())
     }
 
     fn unscale_outputs(&mut self, channels: &[ScaledChannel], x: &str) {

@@ -53,6 +53,8 @@ pub struct Weights {
     /// Of the skip, where there is one. f64: its large coefficients act on small differences of
     /// neighbouring samples.
     pub skip: Option<SkipWeights>,
+    /// The guide of the estimates, where the configuration has bounds.
+    pub guard: Option<LinearWeights>,
 }
 
 /// `auxiliary.safetensors`: estimators to compare with, and the envelope's projection.
@@ -188,6 +190,9 @@ impl Weights {
         if let Some(skip) = &self.skip {
             tensors.extend(skip_tensors(skip));
         }
+        if let Some(guard) = &self.guard {
+            tensors.extend(linear("guard", guard));
+        }
         to_file(&tensors)
     }
 
@@ -213,7 +218,12 @@ impl Weights {
         } else {
             None
         };
-        Ok(Self { layers, skip })
+        let guard = config
+            .guard
+            .as_ref()
+            .map(|_| reader.linear("guard", config.targets.len(), window_values))
+            .transpose()?;
+        Ok(Self { layers, skip, guard })
     }
 }
 

@@ -5,15 +5,15 @@ use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
 use crate::predict::Predictor;
-use crate::scheduled::RANGE_FACTOR;
+use crate::runs::Runs;
 use crate::structure::parameter_count;
 use crate::train::Outcome;
 use crate::train::prepare::{Part, Problem, TrainingData};
 use crate::window::{Series, Windows};
 use hydroflex_openapi::job::WindowCut;
 use hydroflex_openapi::model::{
-    DenseLayer, Envelope, EnvelopeGroup, GoldenPrediction, MODEL_FORMAT_VERSION, ModelConfig,
-    ModelProvenance, ModelSummary, TargetMetrics,
+    DenseLayer, Envelope, GoldenPrediction, Guard, MODEL_FORMAT_VERSION, ModelConfig, ModelProvenance,
+    ModelSummary, TargetMetrics,
 };
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
@@ -24,17 +24,10 @@ use std::path::Path;
 const GOLDEN_WINDOWS: usize = 3;
 /// Version of the tensor framework, as in the workspace's manifest.
 const BURN_VERSION: &str = "0.22.1";
-/// Directions of the envelope have at least this part of the largest variance: below, rounding of the
-/// scaled inputs to f32 would be seen.
-const ENVELOPE_CUT: f64 = 1e-12;
-/// Variances within a group differ by at most this many powers of ten.
-const ENVELOPE_DECADES: f64 = 2.0;
-/// Part of the validation windows within each group's limit, before the limit is widened …
-const ENVELOPE_QUANTILE: f64 = 0.998;
-/// … by this factor, for what a few runs did not show.
-const ENVELOPE_ROOM: f64 = 1.5;
-/// Room around the training range of each input, relative to it: as far as our network follows.
-const ENVELOPE_MARGIN: f64 = 0.5 * (RANGE_FACTOR - 1.0);
+/// Room around the largest distance between estimate, or target, and guide on the training and validation runs …
+const GUARD_ROOM: f64 = 1.5;
+/// … and around the range of the targets, relative to it.
+const GUARD_MARGIN: f64 = 0.5;
 
 /// Assembles the model and writes its folder, replacing what is there.
 ///
@@ -47,7 +40,8 @@ pub fn write_model(
     out_dir: &Path,
 ) -> Result<ModelSummary, ModelError> {
     let weights = fold(problem, &outcome.parameters);
-    let (envelope, projection) = envelope(problem, data);
+    let (mut envelope, projection) = envelope(problem);
+    set_limits(&mut envelope, problem, &projection);
     let auxiliary = Auxiliary {
         least_squares: LinearWeights::from(&problem.linear),
         quasi_static: quasi_static(problem),
@@ -55,15 +49,13 @@ pub fn write_model(
     };
     let mut config = config(problem, outcome, data);
     config.envelope = Some(envelope);
+    config.guard = Some(guard(problem, &Predictor::new(&config, &weights, &auxiliary)));
     let predictor = Predictor::new(&config, &weights, &auxiliary);
-    let judged = judge(problem, data, &predictor);
+    let judged = judge(problem, &predictor);
     config.validation = judged.network;
     config.validation_least_squares = judged.least_squares;
     config.intervals = judged.intervals;
-    if let Some(envelope) = &mut config.envelope {
-        set_limits(&mut envelope.groups, problem, &auxiliary);
-    }
-    config.golden = golden(problem, data, &predictor);
+    config.golden = golden(problem, &predictor);
     write_parts(&config, &weights, &auxiliary, out_dir)?;
     let model = Model::load(out_dir)?;
     Ok(summary(&model, problem, outcome))
@@ -199,6 +191,56 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
     Weights {
         layers,
         skip: problem.skip.as_ref().map(SkipWeights::from),
+        guard: Some(LinearWeights::from(&problem.guide)),
+    }
+}
+
+/// Bounds that nothing in the training or validation runs touches: neither the targets nor the estimates of
+/// `unlimited`, the model without bounds.
+fn guard(problem: &Problem, unlimited: &Predictor) -> Guard {
+    let scaling = &problem.target_scaling;
+    let targets = problem.spec.targets.len();
+    let mut distance = vec![0.0_f64; targets];
+    let (mut low, mut high) = (vec![f64::INFINITY; targets], vec![f64::NEG_INFINITY; targets]);
+    let mut guide = vec![0.0; targets];
+    let mut workspace = unlimited.workspace();
+    for (part, runs) in [
+        (&problem.train, &problem.seen),
+        (&problem.validation, &problem.validation_inputs),
+    ] {
+        let every = Windows::new(&part.series.run_rows, problem.steps, WindowCut::Overlapping);
+        let mut index = 0;
+        for run in &runs.runs {
+            let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
+            let estimates = unlimited.predict_series_with(&columns, &mut workspace).columns;
+            for k in 0..estimates[0].len() {
+                let first = every.first_row(index);
+                index += 1;
+                problem
+                    .guide
+                    .apply(part.series.window(first, problem.steps), &mut guide);
+                let truth = part.targets.row(first + problem.steps - 1);
+                for t in 0..targets {
+                    let estimate = scaling.scale(t, estimates[t][k]);
+                    let off = (estimate - guide[t]).abs().max((truth[t] - guide[t]).abs());
+                    distance[t] = distance[t].max(off);
+                    low[t] = low[t].min(estimate).min(truth[t]);
+                    high[t] = high[t].max(estimate).max(truth[t]);
+                }
+            }
+        }
+    }
+    let channels = scaling.channels();
+    Guard {
+        slack: (0..targets)
+            .map(|t| GUARD_ROOM * distance[t] * channels[t].scale)
+            .collect(),
+        min: (0..targets)
+            .map(|t| scaling.unscale(t, low[t] - GUARD_MARGIN * (high[t] - low[t])))
+            .collect(),
+        max: (0..targets)
+            .map(|t| scaling.unscale(t, high[t] + GUARD_MARGIN * (high[t] - low[t])))
+            .collect(),
     }
 }
 
@@ -244,43 +286,19 @@ fn quasi_static(problem: &Problem) -> LinearWeights {
     }
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights) {
-    let rows = problem.spectrum.whitening(ENVELOPE_CUT, 0.0);
-    let bias = rows
+/// Envelope without limits, and its projection.
+fn envelope(problem: &Problem) -> (Envelope, LinearWeights) {
+    let (projection, groups) =
+        crate::envelope::projection(&problem.moments, &problem.spectrum, problem.spec.inputs.len());
+    let (min, max) = problem
+        .input_limits
         .iter()
-        .map(|row| {
-            -row.iter()
-                .zip(&problem.moments.mean)
-                .map(|(p, m)| p * m)
-                .sum::<f64>() as f32
-        })
-        .collect();
-    let projection = LinearWeights {
-        weight: rows.iter().flatten().map(|&v| v as f32).collect(),
-        bias,
-    };
-    let positions = data.train.positions(&problem.spec.inputs).unwrap_or_default();
-    let (mut min, mut max) = (Vec::new(), Vec::new());
-    for position in positions {
-        let values = || {
-            data.train
-                .runs
-                .iter()
-                .flat_map(move |run| run.columns[position].iter().copied())
-        };
-        let (low, high) = (
-            values().fold(f64::INFINITY, f64::min),
-            values().fold(f64::NEG_INFINITY, f64::max),
-        );
-        let margin = ENVELOPE_MARGIN * (high - low);
-        min.push(low - margin);
-        max.push(high + margin);
-    }
+        .map(|&[low, high]| (low, high))
+        .unzip();
     (
         Envelope {
-            components: rows.len(),
-            groups: groups(&problem.spectrum.values, rows.len()),
+            components: projection.bias.len(),
+            groups,
             min,
             max,
         },
@@ -288,47 +306,19 @@ fn envelope(problem: &Problem, data: &TrainingData) -> (Envelope, LinearWeights)
     )
 }
 
-/// The first `count` directions, largest variance first, in groups of similar variance; no limits yet.
-fn groups(ascending: &[f64], count: usize) -> Vec<EnvelopeGroup> {
-    let largest = ascending.last().copied().unwrap_or(1.0);
-    let mut groups: Vec<EnvelopeGroup> = Vec::new();
-    let mut edge = f64::INFINITY;
-    for value in ascending.iter().rev().take(count) {
-        let decade = (value / largest).log10();
-        match groups.last_mut() {
-            Some(group) if decade > edge => group.components += 1,
-            _ => {
-                edge = decade - ENVELOPE_DECADES;
-                groups.push(EnvelopeGroup {
-                    components: 1,
-                    limit: f64::MAX,
-                });
-            }
-        }
-    }
-    groups
-}
-
-/// Limits that all but rare validation windows keep.
-fn set_limits(groups: &mut [EnvelopeGroup], problem: &Problem, auxiliary: &Auxiliary) {
-    let Some(map) = &auxiliary.envelope else { return };
-    let projection = crate::predict::kernel::PackedLayer::new(map, &[]);
-    let part = &problem.validation;
-    let mut out = vec![0.0; projection.padded()];
-    let mut squares = vec![Vec::with_capacity(part.windows.len()); groups.len()];
-    for index in 0..part.windows.len() {
-        let window = part.series.window(part.windows.first_row(index), problem.steps);
-        projection.forward(window, window.len(), 1, &mut out);
-        for (all, square) in squares
-            .iter_mut()
-            .zip(crate::predict::group_squares(groups, &out))
-        {
-            all.push(square);
-        }
-    }
-    for (group, squares) in groups.iter_mut().zip(&mut squares) {
-        group.limit = ENVELOPE_ROOM * evaluate::metrics::quantile(squares, ENVELOPE_QUANTILE);
-    }
+/// Limits of the envelope from the calibration runs.
+fn set_limits(envelope: &mut Envelope, problem: &Problem, projection: &LinearWeights) {
+    let honest: Vec<(Series, Windows)> = problem
+        .calibration
+        .iter()
+        .map(|(inputs, _)| {
+            let series = Series::new(inputs, &problem.input_scaling);
+            let windows = Windows::new(&series.run_rows, problem.steps, WindowCut::Overlapping);
+            (series, windows)
+        })
+        .collect();
+    let honest: Vec<(&Series, &Windows)> = honest.iter().map(|(s, w)| (s, w)).collect();
+    crate::envelope::set_limits(&mut envelope.groups, projection, &honest);
 }
 
 struct Judged {
@@ -338,7 +328,7 @@ struct Judged {
 }
 
 /// Errors on the validation runs, of the network as it will predict and of least squares.
-fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judged {
+fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
     let part = &problem.validation;
     let targets = problem.spec.targets.len();
     let scaling = &problem.target_scaling;
@@ -355,19 +345,7 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
             linear[t].push(scaling.unscale(t, row[t]));
         }
     }
-    let mut estimates = vec![Vec::new(); targets];
-    let positions = data
-        .validation
-        .positions(&problem.spec.inputs)
-        .unwrap_or_default();
-    let mut workspace = predictor.workspace();
-    for run in &data.validation.runs {
-        let columns: Vec<&[f64]> = positions.iter().map(|&p| run.columns[p].as_slice()).collect();
-        let series = predictor.predict_series_with(&columns, &mut workspace);
-        for (all, column) in estimates.iter_mut().zip(series.columns) {
-            all.extend(column);
-        }
-    }
+    let estimates = estimates(&problem.validation_inputs, predictor);
     let judge = |estimate: &[Vec<f64>]| -> Vec<TargetMetrics> {
         scaling
             .channels()
@@ -378,9 +356,20 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
             })
             .collect()
     };
-    let intervals = estimates
+    let (mut estimated, mut truth) = (vec![Vec::new(); targets], vec![Vec::new(); targets]);
+    for (inputs, wanted) in &problem.calibration {
+        for (all, part) in estimated.iter_mut().zip(self::estimates(inputs, predictor)) {
+            all.extend(part);
+        }
+        for run in &wanted.runs {
+            for (all, column) in truth.iter_mut().zip(&run.columns) {
+                all.extend(column.iter().skip(problem.steps - 1));
+            }
+        }
+    }
+    let intervals = estimated
         .iter()
-        .zip(&reference)
+        .zip(&truth)
         .zip(scaling.channels())
         .filter_map(|((e, r), channel)| evaluate::intervals::fit(e, r, channel.offset))
         .collect::<Vec<_>>();
@@ -395,14 +384,24 @@ fn judge(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Judge
     }
 }
 
+/// Estimates at the ends of all windows of some runs, run after run, one column per target.
+fn estimates(inputs: &Runs, predictor: &Predictor) -> Vec<Vec<f64>> {
+    let mut estimates = vec![Vec::new(); predictor.target_count()];
+    let mut workspace = predictor.workspace();
+    for run in &inputs.runs {
+        let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
+        let series = predictor.predict_series_with(&columns, &mut workspace);
+        for (all, column) in estimates.iter_mut().zip(series.columns) {
+            all.extend(column);
+        }
+    }
+    estimates
+}
+
 /// Windows spread over the validation runs.
-fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<GoldenPrediction> {
-    let positions = data
-        .validation
-        .positions(&problem.spec.inputs)
-        .unwrap_or_default();
-    let long: Vec<_> = data
-        .validation
+fn golden(problem: &Problem, predictor: &Predictor) -> Vec<GoldenPrediction> {
+    let long: Vec<_> = problem
+        .validation_inputs
         .runs
         .iter()
         .filter(|run| run.len() >= problem.steps)
@@ -413,7 +412,7 @@ fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<
             let run = long.get(i * long.len() / GOLDEN_WINDOWS)?;
             let first = (run.len() - problem.steps) * (i + 1) / (GOLDEN_WINDOWS + 1);
             let window: Vec<f64> = (first..first + problem.steps)
-                .flat_map(|row| positions.iter().map(move |&p| run.columns[p][row]))
+                .flat_map(|row| run.columns.iter().map(move |column| column[row]))
                 .collect();
             let mut estimates = vec![0.0; predictor.target_count()];
             predictor.predict_window(&window, &mut estimates, &mut workspace);
@@ -424,6 +423,11 @@ fn golden(problem: &Problem, data: &TrainingData, predictor: &Predictor) -> Vec<
 
 fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelConfig {
     let sample_time_s = data.train.sample_time_s;
+    let calibrating: Vec<usize> = problem
+        .calibration
+        .iter()
+        .flat_map(|(inputs, _)| inputs.runs.iter().map(crate::runs::RunSamples::len))
+        .collect();
     ModelConfig {
         format_version: MODEL_FORMAT_VERSION,
         structure: problem.structure.name.clone(),
@@ -433,14 +437,27 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         inputs: problem.input_scaling.channels().to_vec(),
         targets: problem.target_scaling.channels().to_vec(),
         linear_skip: problem.structure.linear_skip,
-        input_limits: problem.input_limits.clone(),
+        input_limits: if problem.structure.linear_skip {
+            problem.input_limits.clone()
+        } else {
+            Vec::new()
+        },
         schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),
+        guard: None,
         layers: final_layers(problem),
         provenance: ModelProvenance {
             spec: problem.spec.clone(),
             dataset_sha256: data.dataset_sha256.clone(),
             train_runs: data.train.runs.len(),
             validation_runs: data.validation.runs.len(),
+            calibration_windows: calibrating
+                .iter()
+                .map(|steps| (steps + 1).saturating_sub(problem.steps))
+                .sum(),
+            calibration_s: calibrating
+                .iter()
+                .max()
+                .map_or(0.0, |&steps| steps as f64 * sample_time_s),
             train_windows: problem.train.windows.len(),
             epochs: outcome.epochs,
             best_epoch: outcome.best_epoch,

@@ -11,11 +11,13 @@ pub mod panel;
 mod scale;
 mod simd;
 pub mod skip;
+pub mod guard;
 pub mod sliding;
 pub mod synthetic;
 
 use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
+use guard::GuardKernel;
 use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelConfig};
 use kernel::{PANEL, PackedLayer};
 pub use scale::Sample;
@@ -36,6 +38,7 @@ pub struct Predictor {
     /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
     skip: Option<SkipKernel>,
+    guard: Option<GuardKernel>,
     /// Of the values of a panel.
     places: Vec<usize>,
     intervals: Vec<IntervalTable>,
@@ -68,6 +71,9 @@ pub struct Workspace {
     ping: Vec<f32>,
     pong: Vec<f32>,
     skip: Vec<f64>,
+    guide: Vec<f32>,
+    /// Whether the guard changed an estimate of each window of the last block.
+    limited: Vec<bool>,
     projected: Vec<f32>,
 }
 
@@ -156,6 +162,11 @@ impl Predictor {
                 config.targets.len(),
             )
         });
+        let guard = config
+            .guard
+            .as_ref()
+            .zip(weights.guard.as_ref())
+            .map(|(guard, guide)| GuardKernel::new(guide, guard, &config.targets));
         let envelope = config
             .envelope
             .as_ref()
@@ -173,6 +184,7 @@ impl Predictor {
             targets: Scaling::from_config(&config.targets),
             layers,
             skip,
+            guard,
             places: (0..most).map(|place| place * PANEL).collect(),
             intervals: config.intervals.clone(),
             envelope,
@@ -228,6 +240,8 @@ impl Predictor {
             ping: vec![0.0; PANEL * widest],
             pong: vec![0.0; PANEL * widest],
             skip: vec![0.0; PANEL * skip],
+            guide: vec![0.0; PANEL * self.guard.as_ref().map_or(0, GuardKernel::padded)],
+            limited: vec![false; PANEL],
             projected: vec![0.0; PANEL * projected],
         }
     }
@@ -420,6 +434,8 @@ impl Predictor {
             ping,
             pong,
             skip,
+            guide,
+            limited,
             ..
         } = workspace;
         let scaled = &mut scaled[..rows * targets];
@@ -442,6 +458,9 @@ impl Predictor {
                 if let Some(kernel) = &self.skip {
                     kernel.add(x, stride, rows, skip, scaled);
                 }
+                if let Some(kernel) = &self.guard {
+                    kernel.limit(x, stride, rows, guide, scaled, limited);
+                }
             }
             Windows::Panel { x, places } => {
                 if let Some((layer, others)) = self.layers.split_first() {
@@ -459,11 +478,15 @@ impl Predictor {
                 if let Some(kernel) = &self.skip {
                     kernel.add_panel(x, places, rows, skip, scaled);
                 }
+                if let Some(kernel) = &self.guard {
+                    kernel.limit_panel(x, places, rows, guide, scaled, limited);
+                }
             }
         }
     }
 
-    /// Whether each of the windows is near the training windows; ranges are not looked at.
+    /// Whether each of the windows that [`Self::block`] estimated last is near the training windows: inside the
+    /// envelope, and its estimate not limited. Ranges are not looked at.
     fn inside_block(
         &self,
         windows: Windows<'_>,
@@ -472,33 +495,37 @@ impl Predictor {
         workspace: &mut Workspace,
     ) {
         inside.fill(true);
-        let Some(envelope) = &self.envelope else { return };
-        let projected = &mut workspace.projected;
-        match windows {
-            Windows::Rows { x, stride } => {
-                envelope.projection.forward(x, stride, rows, projected);
-                let rows = projected.chunks(envelope.projection.padded());
-                for (flag, row) in inside.iter_mut().zip(rows) {
-                    *flag = group_squares(&envelope.groups, row)
-                        .zip(&envelope.groups)
-                        .all(|(square, group)| square <= group.limit);
+        if let Some(envelope) = &self.envelope {
+            let projected = &mut workspace.projected;
+            match windows {
+                Windows::Rows { x, stride } => {
+                    envelope.projection.forward(x, stride, rows, projected);
+                    let rows = projected.chunks(envelope.projection.padded());
+                    for (flag, row) in inside.iter_mut().zip(rows) {
+                        *flag = group_squares(&envelope.groups, row)
+                            .zip(&envelope.groups)
+                            .all(|(square, group)| square <= group.limit);
+                    }
                 }
-            }
-            Windows::Panel { x, places } => {
-                envelope.projection.forward_panel(x, places, rows, projected);
-                let mut coordinates = projected.chunks_exact(PANEL);
-                for group in &envelope.groups {
-                    let mut sums = [0.0_f64; PANEL];
-                    for values in coordinates.by_ref().take(group.components) {
-                        for (sum, &v) in sums.iter_mut().zip(values) {
-                            *sum += f64::from(v) * f64::from(v);
+                Windows::Panel { x, places } => {
+                    envelope.projection.forward_panel(x, places, rows, projected);
+                    let mut coordinates = projected.chunks_exact(PANEL);
+                    for group in &envelope.groups {
+                        let mut sums = [0.0_f64; PANEL];
+                        for values in coordinates.by_ref().take(group.components) {
+                            for (sum, &v) in sums.iter_mut().zip(values) {
+                                *sum += f64::from(v) * f64::from(v);
+                            }
+                        }
+                        for (flag, sum) in inside.iter_mut().zip(sums) {
+                            *flag &= sum / group.components.max(1) as f64 <= group.limit;
                         }
                     }
-                    for (flag, sum) in inside.iter_mut().zip(sums) {
-                        *flag &= sum / group.components.max(1) as f64 <= group.limit;
-                    }
                 }
             }
+        }
+        for (flag, limited) in inside.iter_mut().zip(&workspace.limited) {
+            *flag &= !limited;
         }
     }
 

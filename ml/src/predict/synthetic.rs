@@ -68,22 +68,25 @@ impl SyntheticModel {
         let structure = Structure::parse(&spec.structure, spec.window_steps, None)?;
         let values = spec.window_steps * INPUTS.len();
         let layers = structure.layers(values, spec.targets);
-        let weights = Weights {
+        let mut weights = Weights {
             layers: random(&layers, spec.seed),
             skip: structure
                 .linear_skip
                 .then(|| in_f64(&random(&[map("skip", values, spec.targets)], spec.seed + 1).remove(0))),
+            guard: None,
         };
         let linear = random(
             &[
                 map("least_squares", values, spec.targets),
                 map("quasi_static", INPUTS.len(), spec.targets),
                 map("envelope", values, ENVELOPE_COMPONENTS),
+                map("guard", values, spec.targets),
             ],
             spec.seed + 2,
         );
-        let [least_squares, quasi_static, envelope] = <[LinearWeights; 3]>::try_from(linear)
-            .unwrap_or_else(|maps| unreachable!("three maps were asked for, not {}", maps.len()));
+        let [least_squares, quasi_static, envelope, guard] = <[LinearWeights; 4]>::try_from(linear)
+            .unwrap_or_else(|maps| unreachable!("four maps were asked for, not {}", maps.len()));
+        weights.guard = Some(guard);
         let auxiliary = Auxiliary {
             least_squares,
             quasi_static,
@@ -203,6 +206,12 @@ fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> Mod
         "targets": channels(targets),
         "linear_skip": linear_skip,
         "layers": layers,
+        "guard": {
+            // Random weights make estimates of about one scale: wide enough for `signal`, and no wider than needed.
+            "slack": targets.iter().map(|t| 4.0 * t.3).collect::<Vec<_>>(),
+            "min": targets.iter().map(|t| t.2 - 10.0 * t.3).collect::<Vec<_>>(),
+            "max": targets.iter().map(|t| t.2 + 10.0 * t.3).collect::<Vec<_>>(),
+        },
         "provenance": {
             "spec": {"structure": spec.structure, "seed": spec.seed},
             "dataset_sha256": "0".repeat(64),
@@ -393,6 +402,71 @@ mod tests {
                     );
                 }
             }
+        }
+    }
+
+    #[test]
+    fn estimates_of_wild_signals_stay_at_their_bounds_and_are_flagged_on_every_path() {
+        for structure in ["best", "RLR"] {
+            let model = model(structure);
+            let predictor = model.predictor();
+            let mut workspace = predictor.workspace();
+            let guard = model.config.guard.as_ref().unwrap();
+            let guide = model.weights.guard.as_ref().unwrap();
+            // Alternating samples, each in the range of its channel, as no machine makes them.
+            let rows = 40;
+            let mut samples = signal(0, rows);
+            for (i, value) in samples.iter_mut().enumerate() {
+                let (_, _, mean, size) = INPUTS[i % 5];
+                let sign = if (i / 5 + i) % 2 == 0 { 1.0 } else { -1.0 };
+                *value = if i / 5 < 12 {
+                    *value
+                } else {
+                    mean + sign * 1.49 * size * 1e3
+                };
+            }
+            let columns: Vec<Vec<f64>> = (0..5)
+                .map(|c| samples.iter().skip(c).step_by(5).copied().collect())
+                .collect();
+            let columns: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+            let series = predictor.predict_series(&columns);
+            let mut sliding = SlidingWindow::new(&predictor);
+            let mut limited = 0;
+            for row in 0..rows {
+                sliding.push(&predictor, &samples[row * 5..row * 5 + 5]);
+                let mut streamed = [0.0; 3];
+                let inside = sliding.predict(&predictor, &mut streamed, &mut workspace);
+                let Some(k) = row.checked_sub(11) else { continue };
+                let window = &samples[k * 5..(k + 12) * 5];
+                let (mut single, mut flag) = ([0.0; 3], [true]);
+                predictor.predict_windows_with(window, &mut single, Some(&mut flag), &mut workspace);
+                assert_eq!((Some(flag[0]), flag[0]), (inside, series.inside[k]));
+                for (t, channel) in model.config.targets.iter().enumerate() {
+                    let scaled = |(i, v): (usize, &f64)| (v - INPUTS[i % 5].2) / INPUTS[i % 5].3;
+                    let sum: f64 = guide.weight[t * 60..(t + 1) * 60]
+                        .iter()
+                        .zip(window.iter().enumerate().map(scaled))
+                        .map(|(&w, x)| f64::from(w) * x)
+                        .sum();
+                    let near = channel.offset + channel.scale * (sum + f64::from(guide.bias[t]));
+                    // f32 sums of a thousand scales.
+                    let rounding = 1e-3 * channel.scale;
+                    assert!((guard.min[t]..=guard.max[t]).contains(&single[t]) || flag[0]);
+                    let at_range = (single[t] - guard.min[t])
+                        .abs()
+                        .min((single[t] - guard.max[t]).abs());
+                    assert!(
+                        (single[t] - near).abs() <= guard.slack[t] + rounding || at_range <= rounding,
+                        "{structure}, window {k}: {} is not near {near}",
+                        single[t]
+                    );
+                    for other in [streamed[t], series.columns[t][k]] {
+                        assert!((other - single[t]).abs() <= rounding);
+                    }
+                }
+                limited += usize::from(!flag[0]);
+            }
+            assert!(limited >= rows - 12, "{structure}: {limited}");
         }
     }
 

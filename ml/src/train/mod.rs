@@ -13,7 +13,7 @@ use crate::least_squares::SpectrumError;
 use crate::model::ModelError;
 use crate::network::init::epoch_order;
 use crate::network::{NetworkTensors, batch_tensor};
-use crate::runs::RunsError;
+use crate::runs::{Runs, RunsError};
 use crate::scheduled::NormalEquationsError;
 use crate::structure::StructureError;
 use crate::window::WindowError;
@@ -113,6 +113,9 @@ pub enum TrainError {
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] hydroflex_dataset::OpenError),
+    /// Unusable noise.
+    #[error(transparent)]
+    Noise(#[from] crate::noise::NoiseError),
     /// Too few runs.
     #[error(
         "{train} training and {validation} validation runs are too few: at least {} and 1 are needed",
@@ -150,18 +153,20 @@ pub enum TrainError {
     Model(#[from] ModelError),
 }
 
-/// Trains a network on a data set; see [`train`].
+/// Trains a network on a data set; see [`train`]. `calibration`: further runs without a flag, long ones, on which
+/// intervals and envelope are calibrated beside the data set's validation runs.
 ///
 /// # Errors
 /// As [`train`], or the data set cannot be read.
 pub fn train_dataset(
     dataset: &hydroflex_dataset::Dataset,
     spec: &TrainingSpec,
+    calibration: Option<&Runs>,
     progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     checkpoint_dir: &Path,
     out_dir: &Path,
 ) -> Result<ModelSummary, TrainError> {
-    let (data, spec) = crate::dataset::training_data(dataset, spec)?;
+    let (data, spec) = crate::dataset::training_data(dataset, spec, calibration)?;
     train(&data, &spec, progress, checkpoint_dir, out_dir)
 }
 
@@ -353,6 +358,8 @@ fn epoch(
     report: &mut dyn FnMut(f64, f64, &TrainState, &Clock) -> ControlFlow<()>,
 ) -> Result<f64, TrainError> {
     let number = state.counters.epoch;
+    let noisy = problem.epoch_part(number);
+    let part = noisy.as_ref().unwrap_or(&problem.train);
     let order = epoch_order(problem.train.windows.len(), problem.recipe.seed, number);
     let mut gradient = vec![0.0; state.parameters.len()];
     let mut sum = 0.0;
@@ -365,7 +372,7 @@ fn epoch(
             break; // The time limit fell into this epoch.
         }
         let rate = limits.rate(fraction);
-        let loss = batch_gradient(problem, &state.parameters, batch, &mut gradient);
+        let loss = batch_gradient(problem, part, &state.parameters, batch, &mut gradient);
         if !loss.is_finite() || loss > DIVERGENCE {
             return Err(TrainError::Diverged {
                 epoch: number,
@@ -388,17 +395,23 @@ fn epoch(
 
 /// Loss of a batch, its gradient written to `gradient`. Large batches are cut into
 /// parts that run at the same time and are summed in order.
-pub fn batch_gradient(problem: &Problem, parameters: &[f32], batch: &[u32], gradient: &mut [f32]) -> f64 {
+pub fn batch_gradient(
+    problem: &Problem,
+    part: &Part,
+    parameters: &[f32],
+    batch: &[u32],
+    gradient: &mut [f32],
+) -> f64 {
     let divisor = (batch.len() * problem.spec.targets.len()) as f32;
     gradient.fill(0.0);
     if batch.len() < SMALLEST_CUT {
-        return f64::from(part_gradient(problem, parameters, batch, divisor, gradient));
+        return f64::from(part_gradient(problem, part, parameters, batch, divisor, gradient));
     }
     let (first, second) = batch.split_at(batch.len().div_ceil(BATCH_PARTS));
     let mut other = vec![0.0; gradient.len()];
     let (a, b) = rayon::join(
-        || part_gradient(problem, parameters, first, divisor, gradient),
-        || part_gradient(problem, parameters, second, divisor, &mut other),
+        || part_gradient(problem, part, parameters, first, divisor, gradient),
+        || part_gradient(problem, part, parameters, second, divisor, &mut other),
     );
     for (g, o) in gradient.iter_mut().zip(&other) {
         *g += o;
@@ -408,6 +421,7 @@ pub fn batch_gradient(problem: &Problem, parameters: &[f32], batch: &[u32], grad
 
 fn part_gradient(
     problem: &Problem,
+    part: &Part,
     parameters: &[f32],
     batch: &[u32],
     divisor: f32,
@@ -415,7 +429,7 @@ fn part_gradient(
 ) -> f32 {
     let plain = Device::flex();
     let device = plain.clone().autodiff();
-    let (windows, wanted) = gather(&problem.train, batch.iter().map(|&w| w as usize));
+    let (windows, wanted) = gather(part, batch.iter().map(|&w| w as usize));
     let windows = whiten(problem, batch_tensor(windows, batch.len(), &plain));
     NetworkTensors::new(&problem.layers, parameters, &device).loss_and_gradient(
         Tensor::from_inner(windows),

@@ -5,6 +5,7 @@ use crate::evaluate::metrics::quantile;
 use crate::least_squares::{LinearMap, Spectrum, TargetRows, WindowMoments};
 use crate::network::Loss;
 use crate::network::init::initial_parameters;
+use crate::noise::Noise;
 use crate::runs::Runs;
 use crate::scaling::Scaling;
 use crate::scheduled::{RANGE_FACTOR, Sample, ScheduledMap};
@@ -13,6 +14,7 @@ use crate::window::{Series, WindowError, Windows, window_steps};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
 use hydroflex_openapi::model::DenseLayer;
+use rayon::prelude::*;
 
 /// Fewest training runs: with fewer the scales and the linear map say nothing about other runs.
 pub const MIN_TRAIN_RUNS: usize = 2;
@@ -36,6 +38,13 @@ const WHITENING_CUT: f64 = 1e-9;
 /// hold only rounding are not blown up to unit size.
 const WHITENING_FLOOR: f64 = 1e-8;
 
+/// The guide is the linear map that would be best if every sample had an independent error of this part of its
+/// channel's standard deviation: exact enough to be a bound, and too tame to explode on signals unlike the training's.
+const GUIDE_NOISE: f64 = 0.01;
+
+/// First stream of the noise that does not change from epoch to epoch; epochs count from 0.
+const SEEN_STREAM: u64 = 1 << 32;
+
 /// Runs to learn from, with all the channels of their data set.
 #[derive(Debug, Clone)]
 pub struct TrainingData {
@@ -43,6 +52,9 @@ pub struct TrainingData {
     pub train: Runs,
     /// Runs that choose the ridge and the best epoch.
     pub validation: Runs,
+    /// Runs without a flag that are not trained on, by kind (short, long): they calibrate the intervals and the
+    /// envelope. Where none is as long as a window, the validation runs do.
+    pub calibration: Vec<Runs>,
     /// Hash of the data set.
     pub dataset_sha256: String,
 }
@@ -97,6 +109,16 @@ pub struct Problem {
     pub train: Part,
     /// Validation part.
     pub validation: Part,
+    /// Inputs of the training runs as the model will see them: with noise, where there is any.
+    pub seen: Runs,
+    /// The same of the validation runs, of which [`Self::validation`] is made.
+    pub validation_inputs: Runs,
+    /// Runs that calibrate: inputs as the model will see them, and targets.
+    pub calibration: Vec<(Runs, Runs)>,
+    /// Sensor noise.
+    pub noise: Option<Noise>,
+    /// Clean inputs of the training runs, to which every epoch adds other noise; only where there is noise.
+    pub clean: Option<Runs>,
     /// Moments of the training windows.
     pub moments: WindowMoments,
     /// Their spectrum.
@@ -105,9 +127,11 @@ pub struct Problem {
     pub linear: LinearMap,
     /// The same with coefficients that follow the pose: the skip connection of our network.
     pub skip: Option<ScheduledMap>,
+    /// A linear map with small coefficients, near which estimates are kept.
+    pub guide: LinearMap,
     /// What is minimised.
     pub loss: Loss,
-    /// Values at which inputs are held, in their columns' units; none for the paper's structures.
+    /// Ranges of the inputs in their columns' units, within which windows are known and at which our network holds them.
     pub input_limits: Vec<[f64; 2]>,
     /// Typical size of what the network learns, per target, in scaled units (1 without skip).
     pub wanted_scale: Vec<f64>,
@@ -180,6 +204,22 @@ impl Problem {
         ] {
             runs.check()?;
         }
+        let noise = spec
+            .noise
+            .as_ref()
+            .map(|noise| Noise::new(noise, &train_inputs.channels, train_inputs.sample_time_s))
+            .transpose()?;
+        let noisy = |runs: &Runs, stream: u64| {
+            noise
+                .as_ref()
+                .map_or_else(|| runs.clone(), |noise| noise.add(runs, spec.seed, stream))
+        };
+        let train_inputs = match &noise {
+            Some(noise) => noise.differentiated(&train_inputs),
+            None => train_inputs,
+        };
+        let seen = noisy(&train_inputs, SEEN_STREAM);
+        let validation_inputs = noisy(&validation_inputs, SEEN_STREAM + 1);
         let published = spec.windows == WindowCut::Disjoint;
         let steps = match spec.window {
             WindowRule::Given { window_s } => window_steps(window_s, data.train.sample_time_s)?,
@@ -188,7 +228,7 @@ impl Problem {
         let structure = Structure::parse(&spec.structure, steps, spec.width)?;
 
         let scaling: fn(&Runs) -> Scaling = if published { Scaling::paper } else { Scaling::fit };
-        let (input_scaling, target_scaling) = (scaling(&train_inputs), scaling(&train_targets));
+        let (input_scaling, target_scaling) = (scaling(&seen), scaling(&train_targets));
         let part = |inputs: &Runs, targets: &Runs, cut| -> Result<Part, TrainError> {
             let series = Series::new(inputs, &input_scaling);
             let windows = Windows::new(&series.run_rows, steps, cut);
@@ -211,20 +251,42 @@ impl Problem {
 
         // The linear map uses every window even where the network gets the published few.
         let every = Windows::new(&train.series.run_rows, steps, WindowCut::Overlapping);
-        let moments = WindowMoments::gather(&train.series, &every, &train.targets);
+        let mut moments = WindowMoments::gather(&train.series, &every, &train.targets);
+        let noise_covariance = noise
+            .as_ref()
+            .map(|noise| noise.covariance(steps, &input_scaling));
+        if let Some(added) = &noise_covariance {
+            moments.add_noise(added);
+        }
+        let calibration = calibration(data, &spec, steps, &noisy)?;
         let judge = WindowMoments::gather(&validation.series, &validation.windows, &validation.targets);
         let spectrum = Spectrum::new(&moments)?;
         let linear = spectrum.best_map(&moments, &judge);
+        let guide = spectrum.ridge_map(
+            &moments,
+            GUIDE_NOISE * GUIDE_NOISE
+                / spectrum
+                    .values
+                    .last()
+                    .copied()
+                    .unwrap_or(1.0)
+                    .max(f64::MIN_POSITIVE),
+        );
         let skip = if structure.linear_skip {
             Some(ScheduledMap::fit(
                 sample(&train, &every),
                 sample(&validation, &validation.windows),
                 &input_scaling,
                 &slow_inputs(&train_inputs),
+                noise_covariance.as_ref(),
             )?)
         } else {
             None
         };
+        // What the network learns is what the skip leaves over of windows as the model sees them.
+        if noise.is_some() {
+            train.series = Series::new(&seen, &input_scaling);
+        }
         let errors =
             [&train, &validation].map(|part| skip_errors(part, steps, skip.as_ref(), &input_scaling));
         let wanted_scale = wanted_scale(&train, steps, skip.as_ref(), &errors[0]);
@@ -232,6 +294,7 @@ impl Problem {
             part.wanted = in_units_of(&errors, &wanted_scale);
         }
 
+        let input_limits = input_limits(&seen, &calibration);
         let whitening = if published {
             Whitening::default()
         } else {
@@ -253,15 +316,17 @@ impl Problem {
             target_scaling,
             train,
             validation,
+            clean: noise.is_some().then_some(train_inputs),
+            seen,
+            validation_inputs,
+            calibration,
+            noise,
             moments,
             spectrum,
             linear,
             skip,
-            input_limits: if structure.linear_skip {
-                input_limits(&train_inputs)
-            } else {
-                Vec::new()
-            },
+            guide,
+            input_limits,
             loss: if structure.linear_skip {
                 Loss::PseudoHuber
             } else {
@@ -274,6 +339,51 @@ impl Problem {
             parameters,
             recipe,
         })
+    }
+}
+
+/// The calibration runs that are as long as a window, or else the validation runs.
+fn calibration(
+    data: &TrainingData,
+    spec: &TrainingSpec,
+    steps: usize,
+    noisy: &dyn Fn(&Runs, u64) -> Runs,
+) -> Result<Vec<(Runs, Runs)>, TrainError> {
+    let part = |runs: &Runs, stream: u64| -> Result<(Runs, Runs), TrainError> {
+        let (inputs, targets) = (runs.select(&spec.inputs)?, runs.select(&spec.targets)?);
+        inputs.check()?;
+        targets.check()?;
+        Ok((noisy(&inputs, stream), targets))
+    };
+    let long_enough = |runs: &&Runs| runs.runs.iter().any(|run| run.len() >= steps);
+    let parts = data
+        .calibration
+        .iter()
+        .filter(long_enough)
+        .zip(SEEN_STREAM + 2..)
+        .map(|(runs, stream)| part(runs, stream))
+        .collect::<Result<Vec<_>, _>>()?;
+    if parts.is_empty() {
+        return Ok(vec![part(&data.validation, SEEN_STREAM + 1)?]);
+    }
+    Ok(parts)
+}
+
+impl Problem {
+    /// The training part as epoch `epoch` sees it: with noise of its own, where there is any.
+    #[must_use]
+    pub fn epoch_part(&self, epoch: usize) -> Option<Part> {
+        let (noise, clean) = self.noise.as_ref().zip(self.clean.as_ref())?;
+        let runs = noise.add(clean, self.spec.seed, epoch as u64);
+        let mut part = Part {
+            series: Series::new(&runs, &self.input_scaling),
+            windows: self.train.windows.clone(),
+            wanted: Vec::new(),
+            targets: self.train.targets.clone(),
+        };
+        let errors = skip_errors(&part, self.steps, self.skip.as_ref(), &self.input_scaling);
+        part.wanted = in_units_of(&errors, &self.wanted_scale);
+        Some(part)
     }
 }
 
@@ -376,19 +486,28 @@ fn slow_inputs(inputs: &Runs) -> Vec<usize> {
     }
 }
 
-/// The training range of each input, widened as the slow signals' is.
-fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
-    (0..runs.channels.len())
+/// The range of each input over the training runs, widened as the slow signals' is, and over the calibration runs: long
+/// honest runs go a little farther than short ones.
+fn input_limits(seen: &Runs, calibration: &[(Runs, Runs)]) -> Vec<[f64; 2]> {
+    let range = |runs: &Runs, input: usize| {
+        let values = runs
+            .runs
+            .iter()
+            .flat_map(|run| run.columns[input].iter().copied());
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(value), high.max(value))
+        })
+    };
+    (0..seen.channels.len())
         .map(|input| {
-            let values = || {
-                runs.runs
-                    .iter()
-                    .flat_map(|run| run.columns[input].iter().copied())
-            };
-            let low = values().fold(f64::INFINITY, f64::min);
-            let high = values().fold(f64::NEG_INFINITY, f64::max);
+            let (low, high) = range(seen, input);
             let room = 0.5 * (RANGE_FACTOR - 1.0) * (high - low);
-            [low - room, high + room]
+            calibration
+                .iter()
+                .map(|(inputs, _)| range(inputs, input))
+                .fold([low - room, high + room], |[least, most], (low, high)| {
+                    [least.min(low), most.max(high)]
+                })
         })
         .collect()
 }
@@ -398,15 +517,21 @@ fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
 fn skip_errors(part: &Part, steps: usize, skip: Option<&ScheduledMap>, scaling: &Scaling) -> Vec<f64> {
     let width = part.targets.width;
     let mut errors = vec![0.0; part.targets.values.len()];
-    let mut estimate = vec![0.0; width];
-    for index in 0..part.windows.len() {
-        let first = part.windows.first_row(index);
-        let row = first + steps - 1;
-        if let Some(map) = skip {
-            map.apply(scaling, part.series.window(first, steps), &mut estimate);
-        }
-        for t in 0..width {
-            errors[row * width + t] = part.targets.row(row)[t] - estimate[t];
+    let estimates: Vec<Vec<f64>> = (0..part.windows.len())
+        .into_par_iter()
+        .map(|index| {
+            let mut estimate = vec![0.0; width];
+            if let Some(map) = skip {
+                let window = part.series.window(part.windows.first_row(index), steps);
+                map.apply(scaling, window, &mut estimate);
+            }
+            estimate
+        })
+        .collect();
+    for (index, estimate) in estimates.iter().enumerate() {
+        let row = part.windows.first_row(index) + steps - 1;
+        for (t, value) in estimate.iter().enumerate() {
+            errors[row * width + t] = part.targets.row(row)[t] - value;
         }
     }
     errors

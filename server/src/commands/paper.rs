@@ -1,7 +1,8 @@
 //! `hydroflex reproduce-paper`: the published study, made again from nothing.
 //!
-//! For each payload: a data set of random runs, an evaluation set (the published 10 s cycle and random
-//! 10 s runs), the grid of sensors × structures × seeds, and a report. Everything lies below one
+//! For each payload: a data set of random runs, a calibration set (random 10 s runs), an evaluation set (the published
+//! 10 s cycle and other random 10 s runs), the grid of sensors × structures × noise × seeds, and a report; with `--mixed`
+//! also networks for payloads that they are not told. Everything lies below one
 //! directory; what is there already is not made again, so a study that was stopped goes on.
 
 mod report;
@@ -11,12 +12,15 @@ use super::{print_json, print_line};
 use anyhow::{Context as _, ensure};
 use hydroflex_dataset::Dataset;
 use hydroflex_ml::dataset::load_all;
-use hydroflex_ml::evaluate::evaluate;
+use hydroflex_ml::evaluate::faults::fault_rates;
+use hydroflex_ml::evaluate::{evaluate, with_noise_of_training};
 use hydroflex_ml::model::Model;
 use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{Progress, train_dataset};
-use hydroflex_openapi::job::{Excitation, JobSpec, TrainingSpec, ValueOrRange, WindowRule};
-use hydroflex_openapi::model::EvaluationReport;
+use hydroflex_openapi::job::{
+    Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowRule,
+};
+use hydroflex_openapi::model::{EvaluationReport, FaultRate};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
@@ -33,10 +37,12 @@ const EVALUATION_S: f64 = 10.0;
 const CYCLE_ANGLE_DEG: f64 = 18.24;
 /// Random 10 s runs simulated, so that enough of them stay within stroke and pressures.
 const RANDOM_CANDIDATES: u64 = 40;
-/// Those evaluated: the first ones without a flag.
+/// Those whose errors are reported: the first ones without a flag. Intervals, envelope and faults take all without.
 const RANDOM_EVALUATED: usize = 5;
-/// Added to the study's seed for the evaluation, which shares no run with the training.
-const EVALUATION_SEED: u64 = 1_000_003;
+/// Random 10 s runs of which those without a flag calibrate.
+const CALIBRATION_CANDIDATES: u64 = 128;
+/// Added to the study's seed for the calibration runs.
+const CALIBRATION_SEED: u64 = 2_000_003;
 /// Windows of the study in samples: 60 without payload, 100 with.
 const WINDOW_STEPS: [usize; 2] = [60, 100];
 
@@ -76,6 +82,15 @@ pub struct Args {
     /// Seed of the study's runs
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Added to the seed for the evaluation, which shares no run with the training; another one judges anew
+    #[arg(long, default_value_t = 1_000_003)]
+    pub evaluation_seed: u64,
+    /// Sensor noise to train and evaluate with, separated by commas: `none`, `crane`
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "none")]
+    pub noise: Vec<NoiseChoice>,
+    /// Also train networks on random payloads over the range of --payloads, as many runs as all payloads together
+    #[arg(long)]
+    pub mixed: bool,
     /// Largest number of epochs of a training
     #[arg(long)]
     pub epochs: Option<usize>,
@@ -88,6 +103,25 @@ pub struct Args {
     /// Print machine-readable results
     #[arg(long)]
     pub json: bool,
+}
+
+/// Noise to study.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseChoice {
+    /// None, as in the paper
+    None,
+    /// As measured on a crane
+    Crane,
+}
+
+impl NoiseChoice {
+    fn spec(self) -> Option<NoiseSpec> {
+        match self {
+            Self::None => None,
+            Self::Crane => Some(NoiseSpec::Level(NoiseLevel::Crane)),
+        }
+    }
 }
 
 /// Sensors that a network sees, as in the paper.
@@ -162,12 +196,16 @@ fn is_rod_pressure(name: &str) -> bool {
     is_pressure(name) && name.ends_with("_rod_pa")
 }
 
-/// One trained network and what it is worth.
+/// One trained network and what it is worth on one payload.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Cell {
+    /// Of the evaluation.
     payload_kg: f64,
+    /// Of the training runs.
+    trained: Payload,
     sensors: SensorSet,
     structure: String,
+    noise: NoiseChoice,
     seed: u64,
     /// As asked for.
     spec: TrainingSpec,
@@ -176,10 +214,56 @@ struct Cell {
     train_seconds: f64,
     /// On the published cycle.
     cycle: EvaluationReport,
-    /// On the random 10 s runs.
+    /// On the first random 10 s runs.
     random: EvaluationReport,
+    /// On all random 10 s runs without a flag: intervals and envelope.
+    calm: EvaluationReport,
+    /// On all random 10 s runs with a flag: end stops, cavitation.
+    flagged: Option<EvaluationReport>,
+    /// Stuck and swapped sensors in the runs of `calm`.
+    faults: Vec<FaultRate>,
+    /// Part of the windows flagged of the other payloads' random runs without a flag.
+    other_payloads: Vec<(f64, f64)>,
     /// On the validation runs: short, of the same kind as the training runs.
     validation_mae: Vec<f64>,
+}
+
+/// Payload of a data set.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+enum Payload {
+    Fixed(f64),
+    Range { min: f64, max: f64 },
+}
+
+impl Payload {
+    fn name(self) -> String {
+        match self {
+            Self::Fixed(kg) => format!("{kg}kg"),
+            Self::Range { min, max } => format!("{min}-{max}kg"),
+        }
+    }
+
+    fn asked(self) -> ValueOrRange {
+        match self {
+            Self::Fixed(kg) => ValueOrRange::Value(kg),
+            Self::Range { min, max } => ValueOrRange::Range { min, max },
+        }
+    }
+
+    fn window_steps(self) -> usize {
+        WINDOW_STEPS[usize::from(self != Self::Fixed(0.0))]
+    }
+}
+
+/// Data sets of one payload.
+struct Sets {
+    payload: Payload,
+    folder: PathBuf,
+    training: Dataset,
+    calibration: Runs,
+    /// Of a fixed payload.
+    evaluation: Option<Dataset>,
 }
 
 /// Runs the command.
@@ -200,41 +284,41 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
     let simulator = Simulator::new(Machine::load(&args.machine, &args.mesh)?)?;
-    let machine = simulator.machine();
+    let mut payloads: Vec<Payload> = args.payloads.iter().map(|&kg| Payload::Fixed(kg)).collect();
+    if args.mixed {
+        payloads.push(Payload::Range {
+            min: args.payloads.iter().copied().fold(f64::INFINITY, f64::min),
+            max: args.payloads.iter().copied().fold(0.0, f64::max),
+        });
+    }
+    let sets = payloads
+        .into_iter()
+        .map(|payload| make_sets(&args, &simulator, payload))
+        .collect::<anyhow::Result<Vec<_>>>()?;
     let mut cells = Vec::new();
-    for &payload_kg in &args.payloads {
-        let folder = args.out.join(format!("{payload_kg}kg"));
-        std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
-        let training = data_set(
-            &args,
-            machine,
-            &folder,
-            "training",
-            training_runs(&args, &simulator, payload_kg)?,
-        )?;
-        let evaluation = data_set(
-            &args,
-            machine,
-            &folder,
-            "evaluation",
-            evaluation_runs(&args, &simulator, payload_kg)?,
-        )?;
+    for trained in &sets {
         for &sensors in &args.sensors {
             for structure in &args.structures {
-                for seed in 0..args.seeds {
-                    let study = Study {
-                        args: &args,
-                        folder: &folder,
-                        training: &training,
-                        evaluation: &evaluation,
-                        payload_kg,
-                    };
-                    cells.push(study.cell(sensors, structure, seed)?);
+                for &noise in &args.noise {
+                    for seed in 0..args.seeds {
+                        let study = Study {
+                            args: &args,
+                            sets: &sets,
+                            trained,
+                        };
+                        cells.extend(study.cells(sensors, structure, noise, seed)?);
+                    }
                 }
             }
         }
     }
-    let text = report::markdown(&args, &machine.file().name, &cells);
+    // Seeds of a cell side by side.
+    cells.sort_by(|a, b| {
+        let key = |c: &Cell| (c.trained.name(), c.payload_kg.to_bits());
+        let position = |c: &Cell| sets.iter().position(|set| set.payload == c.trained);
+        position(a).cmp(&position(b)).then_with(|| key(a).cmp(&key(b)))
+    });
+    let text = report::markdown(&args, &simulator.machine().file().name, &cells);
     let path = args.out.join("report.md");
     std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
     if args.json {
@@ -251,39 +335,85 @@ fn shorten(args: &mut Args) {
     args.time_limit_s = args.time_limit_s.or(Some(10.0));
 }
 
-fn job(args: &Args, payload_kg: f64, runs: u64, duration_s: f64, seed: u64) -> anyhow::Result<JobSpec> {
+fn make_sets(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow::Result<Sets> {
+    let machine = simulator.machine();
+    let folder = args.out.join(payload.name());
+    std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    let set = |name: &str, runs| data_set(args, machine, &folder, name, runs);
+    let training = set("training", training_runs(args, simulator, payload)?)?;
+    let calibration = set(
+        "calibration",
+        random_runs(args, simulator, payload, CALIBRATION_CANDIDATES, CALIBRATION_SEED)?,
+    )?;
+    let evaluation = match payload {
+        Payload::Fixed(_) => Some(set("evaluation", evaluation_runs(args, simulator, payload)?)?),
+        Payload::Range { .. } => None,
+    };
+    Ok(Sets {
+        payload,
+        training,
+        calibration: super::train::calm_runs(&calibration)?,
+        evaluation,
+        folder,
+    })
+}
+
+fn job(args: &Args, payload: Payload, runs: u64, duration_s: f64, seed: u64) -> anyhow::Result<JobSpec> {
     let mut spec: JobSpec = serde_json::from_value(serde_json::json!({ "runs": runs }))?;
     spec.seed = args.seed.wrapping_add(seed);
     spec.duration_s = duration_s;
     spec.sample_time_s = SAMPLE_S;
-    spec.payload_kg = ValueOrRange::Value(payload_kg);
+    spec.payload_kg = payload.asked();
     spec.excitation = Excitation::Random;
     Ok(spec)
 }
 
 /// Random runs of 1 s: four fifths train, one fifth validates.
-fn training_runs(args: &Args, simulator: &Simulator, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+fn training_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow::Result<Vec<RunInput>> {
     let file = simulator.machine().file();
-    let count = args.runs + args.runs.div_ceil(4);
-    let spec = job(args, payload_kg, count, 1.0, 0)?;
+    let runs = match payload {
+        Payload::Fixed(_) => args.runs,
+        Payload::Range { .. } => args.runs * args.payloads.len() as u64,
+    };
+    let count = runs + runs.div_ceil(4);
+    let spec = job(args, payload, count, 1.0, 0)?;
+    (0..count)
+        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
+        .collect()
+}
+
+/// Random runs of 10 s.
+fn random_runs(
+    args: &Args,
+    simulator: &Simulator,
+    payload: Payload,
+    count: u64,
+    seed: u64,
+) -> anyhow::Result<Vec<RunInput>> {
+    let file = simulator.machine().file();
+    let spec = job(args, payload, count, EVALUATION_S, seed)?;
     (0..count)
         .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
         .collect()
 }
 
 /// Run 0 is the published cycle; random signals of the same length follow.
-fn evaluation_runs(args: &Args, simulator: &Simulator, payload_kg: f64) -> anyhow::Result<Vec<RunInput>> {
+fn evaluation_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow::Result<Vec<RunInput>> {
     let file = simulator.machine().file();
     let mut spec = job(
         args,
-        payload_kg,
+        payload,
         RANDOM_CANDIDATES + 1,
         EVALUATION_S,
-        EVALUATION_SEED,
+        args.evaluation_seed,
     )?;
-    let mut runs: Vec<RunInput> = (0..=RANDOM_CANDIDATES)
-        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
-        .collect::<anyhow::Result<_>>()?;
+    let mut runs = random_runs(
+        args,
+        simulator,
+        payload,
+        RANDOM_CANDIDATES + 1,
+        args.evaluation_seed,
+    )?;
     spec.excitation = Excitation::Cycle;
     runs[0] = plan_run(&spec, file, simulator, 0)?;
     runs[0].angles_rad = vec![CYCLE_ANGLE_DEG.to_radians(); runs[0].angles_rad.len()];
@@ -326,21 +456,33 @@ fn data_set(
     Ok(dataset)
 }
 
-/// What the trainings of one payload share.
+/// What the trainings on one data set share.
 struct Study<'a> {
     args: &'a Args,
-    folder: &'a Path,
-    training: &'a Dataset,
-    evaluation: &'a Dataset,
-    payload_kg: f64,
+    sets: &'a [Sets],
+    trained: &'a Sets,
 }
 
 impl Study<'_> {
-    fn cell(&self, sensors: SensorSet, structure: &str, seed: u64) -> anyhow::Result<Cell> {
-        let steps = WINDOW_STEPS[usize::from(self.payload_kg > 0.0)];
+    /// One network; a cell per payload that it is evaluated on: its own, or all of those in its range.
+    fn cells(
+        &self,
+        sensors: SensorSet,
+        structure: &str,
+        noise: NoiseChoice,
+        seed: u64,
+    ) -> anyhow::Result<Vec<Cell>> {
+        let Sets {
+            payload,
+            folder,
+            training,
+            calibration,
+            ..
+        } = self.trained;
+        let steps = payload.window_steps();
         let spec = TrainingSpec {
             structure: structure.to_owned(),
-            inputs: sensors.channels(self.training),
+            inputs: sensors.channels(training),
             targets: self.args.targets.clone(),
             window: WindowRule::Given {
                 window_s: steps as f64 * SAMPLE_S,
@@ -348,85 +490,159 @@ impl Study<'_> {
             seed,
             epochs: self.args.epochs,
             time_limit_s: self.args.time_limit_s,
+            noise: noise.spec(),
             ..TrainingSpec::default()
         };
-        let name = format!("{}-{structure}-{seed}", sensors.name());
-        let path = self.folder.join(format!("{name}.json"));
-        if let Some(cell) = finished(&path, self.training, &spec) {
-            return Ok(cell);
+        let noisy = if noise == NoiseChoice::Crane { "-crane" } else { "" };
+        let name = format!("{}-{structure}{noisy}-{seed}", sensors.name());
+        let path = folder.join(format!("{name}.json"));
+        let evaluated: Vec<(f64, &Dataset)> = self
+            .sets
+            .iter()
+            .filter_map(|set| match (set.payload, &set.evaluation) {
+                (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
+                _ => None,
+            })
+            .filter(|(kg, _)| match payload {
+                Payload::Fixed(own) => own.to_bits() == kg.to_bits(),
+                Payload::Range { .. } => true,
+            })
+            .collect();
+        if let Some(cells) = finished(&path, training, &spec, &evaluated) {
+            return Ok(cells);
         }
-        let model_dir = self.folder.join(&name);
-        let checkpoint = self.folder.join(format!(".{name}.checkpoint"));
+        let model_dir = folder.join(&name);
+        let checkpoint = folder.join(format!(".{name}.checkpoint"));
         let bar = super::train::training_bar(self.args.json);
         let mut progress = |progress: Progress| {
             super::train::show(&bar, &progress);
             ControlFlow::Continue(())
         };
-        let summary = train_dataset(self.training, &spec, &mut progress, &checkpoint, &model_dir);
+        let summary = train_dataset(
+            training,
+            &spec,
+            Some(calibration),
+            &mut progress,
+            &checkpoint,
+            &model_dir,
+        );
         bar.finish_and_clear();
-        let summary = summary.with_context(|| format!("cannot train {name} at {} kg", self.payload_kg))?;
+        let summary = summary.with_context(|| format!("cannot train {name} at {}", payload.name()))?;
         // Only an empty directory is removed: whatever else is in it is not ours.
         let _ = std::fs::remove_dir(&checkpoint);
         let model = Model::load(&model_dir)?;
-        let (cycle, random) = self.evaluation_runs(&model)?;
-        let sha256 = self.evaluation.dataset_sha256();
-        let cell = Cell {
-            payload_kg: self.payload_kg,
-            sensors,
-            structure: structure.to_owned(),
-            seed,
-            spec,
-            window_steps: steps,
-            parameters: summary.parameters,
-            train_seconds: summary.train_seconds,
-            cycle: evaluate(&model, &cycle, sha256)?.report,
-            random: evaluate(&model, &random, sha256)?.report,
-            validation_mae: summary.validation.iter().map(|m| m.mae).collect(),
-        };
-        std::fs::write(&path, serde_json::to_vec_pretty(&cell)?)
-            .with_context(|| format!("cannot write {}", path.display()))?;
-        if !self.args.json {
-            print_line(format_args!("{}", report::line(&cell)))?;
+        let mut cells = Vec::new();
+        for (payload_kg, evaluation) in evaluated {
+            let runs = evaluation_parts(&model, evaluation, seed)
+                .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
+            let sha256 = evaluation.dataset_sha256();
+            let report = |runs: &Runs| anyhow::Ok(evaluate(&model, runs, sha256)?.report);
+            let cell = Cell {
+                payload_kg,
+                trained: *payload,
+                sensors,
+                structure: structure.to_owned(),
+                noise,
+                seed,
+                spec: spec.clone(),
+                window_steps: steps,
+                parameters: summary.parameters,
+                train_seconds: summary.train_seconds,
+                cycle: report(&runs.cycle)?,
+                random: report(&runs.random)?,
+                calm: report(&runs.calm)?,
+                flagged: (!runs.flagged.runs.is_empty())
+                    .then(|| report(&runs.flagged))
+                    .transpose()?,
+                faults: fault_rates(&model, &runs.calm)?,
+                other_payloads: self.other_payloads(&model, seed)?,
+                validation_mae: summary.validation.iter().map(|m| m.mae).collect(),
+            };
+            if !self.args.json {
+                print_line(format_args!("{}", report::line(&cell)))?;
+            }
+            cells.push(cell);
         }
-        Ok(cell)
+        std::fs::write(&path, serde_json::to_vec_pretty(&cells)?)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        Ok(cells)
     }
 
-    /// The cycle, and the first random runs within stroke and pressures.
-    fn evaluation_runs(&self, model: &Model) -> anyhow::Result<(Runs, Runs)> {
-        let config = model.config();
-        let channels = config.inputs.iter().chain(&config.targets);
-        let names: Vec<String> = channels.map(|c| c.name.clone()).collect();
-        let all = load_all(self.evaluation, &names)?;
-        let calm = |run_id: u64| {
-            self.evaluation
-                .run(run_id)
-                .is_some_and(|row| row.flags.is_empty())
+    /// Part of the windows outside the envelope, by payload, of the payloads that the model was not trained on.
+    fn other_payloads(&self, model: &Model, seed: u64) -> anyhow::Result<Vec<(f64, f64)>> {
+        let Payload::Fixed(own) = self.trained.payload else {
+            return Ok(Vec::new());
         };
-        let part = |chosen: &dyn Fn(u64) -> bool, count: usize| Runs {
-            channels: all.channels.clone(),
-            sample_time_s: all.sample_time_s,
-            runs: all
-                .runs
-                .iter()
-                .filter(|run| chosen(run.run_id))
-                .take(count)
-                .cloned()
-                .collect(),
-        };
-        let random = part(&|id| id > 0 && calm(id), RANDOM_EVALUATED);
-        ensure!(
-            !random.runs.is_empty(),
-            "none of {RANDOM_CANDIDATES} random runs at {} kg stays within stroke and pressures",
-            self.payload_kg
-        );
-        Ok((part(&|id| id == 0, 1), random))
+        let mut parts = Vec::new();
+        for set in self.sets {
+            if let (Payload::Fixed(kg), Some(evaluation)) = (set.payload, &set.evaluation)
+                && kg.to_bits() != own.to_bits()
+            {
+                let runs = evaluation_parts(model, evaluation, seed)?.calm;
+                let inside = evaluate(model, &runs, evaluation.dataset_sha256())?
+                    .report
+                    .inside_envelope;
+                parts.extend(inside.map(|inside| (kg, 1.0 - inside)));
+            }
+        }
+        Ok(parts)
     }
 }
 
-/// A cell of an earlier call, if it belongs to this data set and was asked for in the same way.
-fn finished(path: &Path, training: &Dataset, spec: &TrainingSpec) -> Option<Cell> {
+/// Evaluation runs by kind, with the noise of the model's training.
+struct EvaluationParts {
+    cycle: Runs,
+    random: Runs,
+    calm: Runs,
+    flagged: Runs,
+}
+
+fn evaluation_parts(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::Result<EvaluationParts> {
+    let config = model.config();
+    let channels = config.inputs.iter().chain(&config.targets);
+    let names: Vec<String> = channels.map(|c| c.name.clone()).collect();
+    let all = with_noise_of_training(model, &load_all(evaluation, &names)?, seed)?;
+    let is_calm = |run_id: u64| evaluation.run(run_id).is_some_and(|row| row.flags.is_empty());
+    let part = |chosen: &dyn Fn(u64) -> bool, count: usize| Runs {
+        channels: all.channels.clone(),
+        sample_time_s: all.sample_time_s,
+        runs: all
+            .runs
+            .iter()
+            .filter(|run| chosen(run.run_id))
+            .take(count)
+            .cloned()
+            .collect(),
+    };
+    let calm = |id| id > 0 && is_calm(id);
+    let parts = EvaluationParts {
+        cycle: part(&|id| id == 0, 1),
+        random: part(&calm, RANDOM_EVALUATED),
+        calm: part(&calm, usize::MAX),
+        flagged: part(&|id| id > 0 && !is_calm(id), usize::MAX),
+    };
+    ensure!(
+        !parts.random.runs.is_empty(),
+        "none of {RANDOM_CANDIDATES} random runs stays within stroke and pressures"
+    );
+    Ok(parts)
+}
+
+/// Cells of an earlier call, if they belong to these data sets and were asked for in the same way.
+fn finished(
+    path: &Path,
+    training: &Dataset,
+    spec: &TrainingSpec,
+    evaluated: &[(f64, &Dataset)],
+) -> Option<Vec<Cell>> {
     let model = Model::load(&path.with_extension("")).ok()?;
     let same = model.config().provenance.dataset_sha256 == training.dataset_sha256();
-    let cell: Cell = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
-    (same && cell.spec == *spec && cell.cycle.model_sha256 == model.sha256()).then_some(cell)
+    let cells: Vec<Cell> = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
+    let matches = |(cell, (kg, evaluation)): (&Cell, &(f64, &Dataset))| {
+        cell.payload_kg.to_bits() == kg.to_bits()
+            && cell.spec == *spec
+            && cell.cycle.model_sha256 == model.sha256()
+            && cell.cycle.dataset_sha256 == evaluation.dataset_sha256()
+    };
+    (same && cells.len() == evaluated.len() && cells.iter().zip(evaluated).all(matches)).then_some(cells)
 }

@@ -1,10 +1,15 @@
 //! `hydroflex train`: a network from a data set on disk.
 
+use crate::calibration;
+use crate::coordinator::machines::CheckedMachine;
 use anyhow::Context as _;
 use hydroflex_dataset::Dataset;
+use hydroflex_ml::dataset::load_all;
 use hydroflex_ml::evaluate::table::table;
+use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{Progress, train_dataset};
-use hydroflex_openapi::job::{TrainingSpec, WindowRule};
+use hydroflex_openapi::dataset::DatasetSource;
+use hydroflex_openapi::job::{NoiseLevel, NoiseSpec, TrainingSpec, WindowRule};
 use hydroflex_openapi::model::{BaselineMetrics, EvaluationReport, ModelSummary};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ops::ControlFlow;
@@ -40,6 +45,17 @@ pub struct Args {
     /// Largest training time in seconds
     #[arg(long)]
     pub time_limit_s: Option<f64>,
+    /// Sensor noise to train for: `crane` (0.49 mm, 11.7 kPa, one bit of twelve), or COLUMN=STANDARD_DEVIATION, separated
+    /// by commas
+    #[arg(long, value_parser = parse_noise)]
+    pub noise: Option<NoiseSpec>,
+    /// Data set directory of long runs on which intervals and envelope are calibrated, runs without a flag only
+    /// (default: runs of 10 s simulated from the data set's job)
+    #[arg(long)]
+    pub calibration: Option<PathBuf>,
+    /// Mesh file that was uploaded for the data set's job; may be repeated
+    #[arg(long)]
+    pub mesh: Vec<PathBuf>,
     /// Print a machine-readable summary
     #[arg(long)]
     pub json: bool,
@@ -62,7 +78,14 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         seed: args.seed,
         epochs: args.epochs,
         time_limit_s: args.time_limit_s,
+        noise: args.noise,
         ..TrainingSpec::default()
+    };
+    let long = match &args.calibration {
+        Some(path) => Some(calm_runs(
+            &Dataset::open(path).with_context(|| format!("cannot open {}", path.display()))?,
+        )?),
+        None => simulated(&dataset, &args.mesh),
     };
     let bar = training_bar(args.json);
     let mut progress = |progress: Progress| {
@@ -70,7 +93,14 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         ControlFlow::Continue(())
     };
     let checkpoint = checkpoint_dir(&args.out);
-    let result = train_dataset(&dataset, &spec, &mut progress, &checkpoint, &args.out);
+    let result = train_dataset(
+        &dataset,
+        &spec,
+        long.as_ref(),
+        &mut progress,
+        &checkpoint,
+        &args.out,
+    );
     bar.finish_and_clear();
     let summary = result.with_context(|| format!("cannot train on {}", args.data.display()))?;
     // Only an empty directory is removed: whatever else is in it is not ours.
@@ -79,6 +109,50 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         return super::print_json(&summary);
     }
     super::print_line(format_args!("{}", describe(&summary, &args.out)))
+}
+
+/// `crane`, or `COLUMN=VALUE,COLUMN=VALUE`.
+pub(crate) fn parse_noise(text: &str) -> Result<NoiseSpec, String> {
+    if text == "crane" {
+        return Ok(NoiseSpec::Level(NoiseLevel::Crane));
+    }
+    text.split(',')
+        .map(|part| {
+            let (name, value) = part.split_once('=').ok_or_else(|| {
+                format!("{part:?} is neither a level (crane) nor COLUMN=STANDARD_DEVIATION")
+            })?;
+            let value = value
+                .parse()
+                .map_err(|_| format!("{value:?} is not a standard deviation"))?;
+            Ok((name.to_owned(), value))
+        })
+        .collect::<Result<_, _>>()
+        .map(NoiseSpec::Channels)
+}
+
+/// Runs of a data set without a flag, all channels.
+pub(crate) fn calm_runs(dataset: &Dataset) -> anyhow::Result<Runs> {
+    let names: Vec<String> = dataset.channels().iter().map(|c| c.name.clone()).collect();
+    let mut runs = load_all(dataset, &names)?;
+    runs.runs
+        .retain(|run| dataset.run(run.run_id).is_some_and(|row| row.flags.is_empty()));
+    Ok(runs)
+}
+
+/// Long runs of the job that made the data set; without them, says why on standard error.
+fn simulated(dataset: &Dataset, meshes: &[PathBuf]) -> Option<Runs> {
+    let DatasetSource::Job { spec } = &dataset.manifest().source else {
+        return None;
+    };
+    let made = super::reproduce::ready_machine(spec, None, meshes)
+        .and_then(|ready| calibration::simulate(spec, &CheckedMachine::new(ready)));
+    match made {
+        Ok(runs) => Some(runs),
+        Err(error) => {
+            eprintln!("note: the validation runs calibrate the intervals alone: {error:#}");
+            None
+        }
+    }
 }
 
 /// Where an unfinished training of `out` keeps its state: beside the model folder.

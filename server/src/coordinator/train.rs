@@ -3,16 +3,21 @@
 //! A checkpoint directory per training, named after it, below the cache: a trainer that was killed goes
 //! on where the last one stopped.
 
+use super::machines::CheckedMachine;
+use crate::calibration;
 use anyhow::Context;
 use hydroflex_dataset::Dataset;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
 use hydroflex_ledger::{Ledger, NewModel, TrainingClaim, identity};
 use hydroflex_ml::model::Model;
+use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{self, TrainError};
 use hydroflex_openapi::catalogue::FileEntry;
+use hydroflex_openapi::dataset::DatasetSource;
 use hydroflex_openapi::id::ModelId;
 use hydroflex_openapi::status::TrainingProgress;
+use hydroflex_worker::machines::Machines;
 use sha2::{Digest, Sha256};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -54,11 +59,12 @@ pub async fn work(config: TrainerConfig, mut stop: watch::Receiver<bool>) -> any
         }
     };
     let blobs = Blobs::open(&config.store)?;
+    let machines = Arc::new(Machines::new(config.cache.clone()));
     let name = identity::worker_name("trainer", 1);
     ledger.register_worker(&name, None).await?;
     let heart = tokio::spawn(beat(ledger.clone(), name.clone()));
     let ended = tokio::select! {
-        ended = serve(&ledger, &blobs, &config.cache, &name, stop.clone()) => ended,
+        ended = serve(&ledger, &blobs, &machines, &config.cache, &name, stop.clone()) => ended,
         // Given up: somebody else may have the training. The supervisor starts us anew.
         _ = heart => Ok(()),
     };
@@ -69,6 +75,7 @@ pub async fn work(config: TrainerConfig, mut stop: watch::Receiver<bool>) -> any
 async fn serve(
     ledger: &Ledger,
     blobs: &Blobs,
+    machines: &Arc<Machines>,
     cache: &Path,
     name: &str,
     mut stop: watch::Receiver<bool>,
@@ -79,7 +86,7 @@ async fn serve(
                 crash_point("train-begin");
                 let training = claim.training.id;
                 tracing::info!(%training, attempt = claim.training.attempt, "training begun");
-                if let Err(error) = attempt(ledger, blobs, cache, &claim, &stop).await {
+                if let Err(error) = attempt(ledger, blobs, machines, cache, &claim, &stop).await {
                     let reason = format!("{error:#}");
                     tracing::warn!(%training, reason, "training attempt lost");
                     ledger
@@ -104,6 +111,7 @@ async fn serve(
 async fn attempt(
     ledger: &Ledger,
     blobs: &Blobs,
+    machines: &Arc<Machines>,
     cache: &Path,
     claim: &TrainingClaim,
     stop: &watch::Receiver<bool>,
@@ -116,9 +124,10 @@ async fn attempt(
     let mut work = tokio::task::spawn_blocking({
         let (spec, folder) = (claim.training.spec.clone(), folder.clone());
         let (latest, cancel) = (latest.clone(), cancel.clone());
+        let (machines, blobs) = (machines.clone(), blobs.clone());
         move || {
             let _temporary = temporary;
-            learn(&dataset, &spec, &folder, &latest, &cancel)
+            learn(&dataset, &spec, &machines, &blobs, &folder, &latest, &cancel)
         }
     });
     let mut reported = None;
@@ -164,11 +173,14 @@ async fn attempt(
 fn learn(
     dataset: &Path,
     spec: &hydroflex_openapi::job::TrainingSpec,
+    machines: &Machines,
+    blobs: &Blobs,
     folder: &Path,
     latest: &std::sync::Mutex<Option<TrainingProgress>>,
     cancel: &AtomicBool,
 ) -> Result<(), TrainError> {
     let dataset = Dataset::open(dataset)?;
+    let long = calibration_runs(&dataset, machines, blobs);
     let mut report = |progress: train::Progress| {
         if let Ok(mut latest) = latest.lock() {
             *latest = Some(TrainingProgress {
@@ -188,11 +200,34 @@ fn learn(
     train::train_dataset(
         &dataset,
         spec,
+        long.as_ref(),
         &mut report,
         &folder.join("checkpoint"),
         &folder.join("model"),
     )
     .map(drop)
+}
+
+/// Long runs of the data set's job; none if they cannot be made, which the model's provenance shows.
+fn calibration_runs(dataset: &Dataset, machines: &Machines, blobs: &Blobs) -> Option<Runs> {
+    let DatasetSource::Job { spec } = &dataset.manifest().source else {
+        return None;
+    };
+    let made = machines
+        .ready(spec, blobs)
+        .map_err(anyhow::Error::from)
+        .and_then(|ready| calibration::simulate(spec, &CheckedMachine::new(ready)));
+    match made {
+        Ok(runs) => Some(runs),
+        Err(error) => {
+            let reason = format!("{error:#}");
+            tracing::warn!(
+                reason,
+                "no long calibration runs; the validation runs calibrate alone"
+            );
+            None
+        }
+    }
 }
 
 /// Puts the model folder into the store under its content's name, then registers it.

@@ -1,6 +1,7 @@
 //! `report.md`: tables in physical units, means over the seeds.
 
-use super::{Args, Cell, RANDOM_EVALUATED};
+use super::{Args, Cell, NoiseChoice, Payload, RANDOM_EVALUATED};
+use hydroflex_ml::evaluate::faults::{EFFECT, STRETCH_S};
 use hydroflex_ml::evaluate::table::{PUBLISHED, display_unit, significant};
 use hydroflex_openapi::model::{EvaluationReport, TargetMetrics};
 use std::fmt::Write as _;
@@ -38,25 +39,8 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
             }
         }
     }
-    text.push_str("\n## Intervals and envelope\n\n| payload | sensors | structure | target | 90 % interval covers: cycle | random | inside the envelope: cycle | random |\n|---|---|---|---|---|---|---|---|\n");
-    for group in groups(cells) {
-        let cell = &group[0];
-        for (t, target) in cell.cycle.targets.iter().enumerate() {
-            let part = |value: Option<f64>| value.map_or_else(String::new, |v| format!("{:.1} %", 100.0 * v));
-            let _ = writeln!(
-                text,
-                "| {} kg | {} | {} | `{}` | {} | {} | {} | {} |",
-                cell.payload_kg,
-                cell.sensors.label(),
-                cell.structure,
-                target.target,
-                part(target.coverage),
-                part(cell.random.targets[t].coverage),
-                part(cell.cycle.inside_envelope),
-                part(cell.random.inside_envelope),
-            );
-        }
-    }
+    intervals(&mut text, cells);
+    envelope(&mut text, cells);
     text.push_str("\n## Published, for comparison\n\nMAE of the vertical deflection over the published cycle, recovered from the plotted curves of Khadim et al. (arXiv 2503.07528), in mm:\n\n");
     for published in PUBLISHED {
         let _ = writeln!(
@@ -69,13 +53,142 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
     text
 }
 
+fn percent(value: f64) -> String {
+    format!("{:.1} %", 100.0 * value)
+}
+
+/// Coverage of the intervals on the cycle and on all random runs without a flag, by thirds of amplitude.
+fn intervals(text: &mut String, cells: &[Cell]) {
+    text.push_str(
+        "\n## 90 % intervals\n\nCalibrated on other random 10 s runs and on the validation runs. Coverage of the cycle and of \
+         all random 10 s runs without a flag, these also by thirds of the reference's distance from the mean.\n\n\
+         | payload | sensors | structure | target | runs | cycle | random | smallest third | middle | largest | mean width |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for group in groups(cells) {
+        let head = &group[0];
+        for (t, target) in head.calm.targets.iter().enumerate() {
+            let (factor, unit) = display(target);
+            let part = |get: &dyn Fn(&Cell) -> Option<f64>| {
+                let values: Vec<f64> = group.iter().filter_map(get).collect();
+                if values.is_empty() {
+                    return String::new();
+                }
+                percent(values.iter().sum::<f64>() / values.len() as f64)
+            };
+            let third = |i: usize| part(&move |c| c.calm.targets[t].coverage_thirds.map(|thirds| thirds[i]));
+            let _ = writeln!(
+                text,
+                "| {} | `{}` | {} | {} | {} | {} | {} | {} | {} {unit} |",
+                label(head),
+                target.target,
+                head.calm.runs,
+                part(&|c| c.cycle.targets[t].coverage),
+                part(&|c| c.calm.targets[t].coverage),
+                third(0),
+                third(1),
+                third(2),
+                mean(group, |c| factor
+                    * c.calm.targets[t].interval_width.unwrap_or(0.0)),
+            );
+        }
+    }
+}
+
+/// What the envelope flags: honest runs, faults, other payloads; and how large errors get where it should.
+fn envelope(text: &mut String, cells: &[Cell]) {
+    let _ = write!(
+        text,
+        "\n## Envelope\n\nPart of the windows that are flagged. A stuck sensor counts where the truth is, on average over the \
+         window, at least {:.0} % of the training range away from the stuck value: before, nobody can know. In brackets the \
+         cases (a sensor stuck for {} s, a run with two channels swapped) of which at least one such window is flagged. \
+         False alarms are flagged windows of honest runs: all random 10 s runs without a flag.\n\n\
+         | payload | sensors | structure | false alarms: cycle | random | fault | flagged windows | found cases |\n\
+         |---|---|---|---|---|---|---|---|\n",
+        100.0 * EFFECT,
+        STRETCH_S,
+    );
+    for group in groups(cells) {
+        let head = &group[0];
+        let alarms = |report: &EvaluationReport| {
+            report
+                .inside_envelope
+                .map_or_else(String::new, |i| percent(1.0 - i))
+        };
+        for (f, fault) in head.faults.iter().enumerate() {
+            let average =
+                |get: &dyn Fn(&Cell) -> f64| percent(group.iter().map(get).sum::<f64>() / group.len() as f64);
+            let _ = writeln!(
+                text,
+                "| {} | {} | {} | {} | {} ({} windows) | {} ({}) |",
+                label(head),
+                alarms(&head.cycle),
+                alarms(&head.calm),
+                fault.fault,
+                average(&|c| c.faults.get(f).map_or(0.0, |f| f.flagged)),
+                fault.windows,
+                average(&|c| c.faults.get(f).map_or(0.0, |f| f.found)),
+                fault.cases,
+            );
+        }
+        for (kg, flagged) in &head.other_payloads {
+            let _ = writeln!(
+                text,
+                "| {} | {} | {} | payload {kg} kg | {} | |",
+                label(head),
+                alarms(&head.cycle),
+                alarms(&head.calm),
+                percent(*flagged),
+            );
+        }
+    }
+    text.push_str(
+        "\n## Beyond the training region\n\nRandom 10 s runs that hit an end stop, cavitate or leave the supply's pressures: \
+         first target.\n\n| payload | sensors | structure | MAE | p95 | max | least squares MAE | p95 | max | flagged windows |\n\
+         |---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for group in groups(cells) {
+        let head = &group[0];
+        let Some(flagged) = &head.flagged else { continue };
+        let (model, linear) = (&flagged.targets[0], &flagged.baselines[0].targets[0]);
+        let (factor, unit) = display(model);
+        let values = [
+            model.mae, model.p95, model.max, linear.mae, linear.p95, linear.max,
+        ];
+        let _ = write!(text, "| {} |", label(head));
+        for value in values {
+            let _ = write!(text, " {} {unit} |", significant(factor * value));
+        }
+        let outside = flagged
+            .inside_envelope
+            .map_or_else(String::new, |i| percent(1.0 - i));
+        let _ = writeln!(text, " {outside} |");
+    }
+}
+
+/// `100 kg | U s | best, crane noise`; a network that is not told the payload says so.
+fn label(cell: &Cell) -> String {
+    let trained = match cell.trained {
+        Payload::Fixed(_) => String::new(),
+        Payload::Range { min, max } => format!(", payload unknown in {min}–{max} kg"),
+    };
+    let noise = match cell.noise {
+        NoiseChoice::None => "",
+        NoiseChoice::Crane => ", crane noise",
+    };
+    format!(
+        "{} kg | {} | {}{trained}{noise}",
+        cell.payload_kg,
+        cell.sensors.label(),
+        cell.structure
+    )
+}
+
 /// One line for the terminal.
 pub(super) fn line(cell: &Cell) -> String {
     let mut text = format!(
-        "{} kg, {}, {}, seed {} ({:.0} s):",
-        cell.payload_kg,
-        cell.sensors.label(),
-        cell.structure,
+        "{}, seed {} ({:.0} s):",
+        label(cell).replace(" |", ","),
         cell.seed,
         cell.train_seconds
     );
@@ -97,7 +210,15 @@ fn display(metrics: &TargetMetrics) -> (f64, &str) {
 }
 
 fn same(a: &Cell, b: &Cell) -> bool {
-    a.payload_kg.to_bits() == b.payload_kg.to_bits() && a.sensors == b.sensors && a.structure == b.structure
+    same_data(a, b) && a.structure == b.structure
+}
+
+/// Same runs, sensors and noise: the baselines are the same.
+fn same_data(a: &Cell, b: &Cell) -> bool {
+    a.payload_kg.to_bits() == b.payload_kg.to_bits()
+        && a.trained == b.trained
+        && a.sensors == b.sensors
+        && a.noise == b.noise
 }
 
 /// Cells that differ in the seed alone; they stand side by side.
@@ -109,7 +230,7 @@ fn first_of_its_sensors(cells: &[Cell], group: &[Cell]) -> bool {
     let head = &group[0];
     cells
         .iter()
-        .find(|c| c.payload_kg.to_bits() == head.payload_kg.to_bits() && c.sensors == head.sensors)
+        .find(|c| same_data(c, head))
         .is_some_and(|first| first.structure == head.structure)
 }
 
@@ -134,12 +255,7 @@ fn mean(group: &[Cell], value: impl Fn(&Cell) -> f64) -> String {
 fn row(group: &[Cell], t: usize) -> String {
     let head = &group[0];
     let (factor, _) = display(&head.cycle.targets[t]);
-    let mut text = format!(
-        "| {} kg | {} | {} |",
-        head.payload_kg,
-        head.sensors.label(),
-        head.structure
-    );
+    let mut text = format!("| {} |", label(head));
     let reports: [fn(&Cell) -> &EvaluationReport; 2] = [|c| &c.cycle, |c| &c.random];
     for report in reports {
         let metric = |get: fn(&TargetMetrics) -> f64| mean(group, |c| factor * get(&report(c).targets[t]));
@@ -171,10 +287,8 @@ fn baselines(cell: &Cell, t: usize) -> String {
     for (cycle, random) in cell.cycle.baselines.iter().zip(&cell.random.baselines) {
         let _ = write!(
             text,
-            "| {} kg | {} | *{}* |",
-            cell.payload_kg,
-            cell.sensors.label(),
-            cycle.name.replace('_', " ")
+            "| {} |",
+            label(cell).replacen(&cell.structure, &format!("*{}*", cycle.name.replace('_', " ")), 1)
         );
         for baseline in [cycle, random] {
             let m = &baseline.targets[t];

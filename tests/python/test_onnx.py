@@ -1,0 +1,69 @@
+"""onnxruntime runs model.onnx and gives the service's numbers: near the training signals, and far from them, where
+estimates are held at their bounds."""
+
+import json
+import sys
+import tempfile
+import urllib.request
+
+import numpy
+import onnxruntime
+
+import test_triton
+
+# Relative to the target's scale. Near: two ways to sum in f32. Far: held inputs make sums of hundreds of scales.
+NEAR, FAR = 1e-5, 1e-3
+
+
+def main():
+    with tempfile.TemporaryDirectory() as folder:
+        service = test_triton.Service(folder)
+        try:
+            test_triton.JOB["train"] = [
+                {"structure": structure, "epochs": 3, "window": {"rule": "given", "window_s": 0.1}}
+                for structure in ("best", "TLSLTLSLT")
+            ]
+            test_triton.trained_model(service)
+            for model in service.ask("/v1/models")["models"]:
+                check(service, model["model_id"])
+        finally:
+            service.kill()
+    print("onnxruntime: all as it should be")
+
+
+def check(service, model):
+    def file(name):
+        with urllib.request.urlopen(f"{service.url}/v1/models/{model}/files/{name}") as answer:
+            return answer.read()
+
+    config = json.loads(file("config.json"))
+    assert config["guard"], "estimates have bounds"
+    session = onnxruntime.InferenceSession(file("model.onnx"), providers=["CPUExecutionProvider"])
+    known = numpy.array([golden["window"] for golden in config["golden"]])
+    known = known.reshape(len(known), config["window_steps"], len(config["inputs"]))
+    rng = numpy.random.default_rng(3)
+    scale = numpy.array([channel["scale"] for channel in config["targets"]])
+    spread = numpy.array([channel["scale"] for channel in config["inputs"]])
+    limited = 0
+    for windows, tolerance in [
+        (known, NEAR),
+        (known + 0.01 * spread * rng.standard_normal(known.shape), NEAR),
+        (numpy.repeat(known, 20, 0) + 10 * spread * rng.standard_normal((20 * len(known), *known.shape[1:])), FAR),
+    ]:
+        ours = service.ask(
+            f"/v2/models/{model}/infer",
+            {"inputs": [{"name": "window", "datatype": "FP64", "shape": list(windows.shape), "data": windows.ravel().tolist()}]},
+        )
+        outputs = {output["name"]: numpy.array(output["data"]) for output in ours["outputs"]}
+        ours = outputs["estimates"].reshape(len(windows), -1)
+        theirs = session.run(["estimates"], {"window": windows})[0]
+        worst = (numpy.abs(ours - theirs) / scale).max()
+        assert worst <= tolerance, f"{config['structure']}: onnxruntime differs by {worst:.1e} of the scale"
+        for target, (low, high) in enumerate(zip(config["guard"]["min"], config["guard"]["max"])):
+            assert (low - 1e-6 * scale[target] <= theirs[:, target]).all() and (theirs[:, target] <= high + 1e-6 * scale[target]).all()
+        limited += int((~outputs["inside_envelope"].astype(bool)).sum())
+    assert limited >= 20 * len(known) - 1, "windows of noise are outside the envelope"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
