@@ -24,13 +24,13 @@ use hydroflex_server::coordinator::{Coordinator, CoordinatorConfig};
 use hydroflex_server::http::AppState;
 use serde_json::json;
 use std::collections::HashMap;
-use std::io::{BufRead, Read, Write};
+use std::io::{BufRead, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio_tungstenite::tungstenite::{Message, client};
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client};
 use tokio_util::sync::CancellationToken;
 
 fn main() -> anyhow::Result<()> {
@@ -222,7 +222,6 @@ struct Seen {
 impl Seen {
     fn add(&mut self, other: Self) {
         self.latencies_us.extend(other.latencies_us);
-        self.late_us.extend(other.late_us);
         for (status, count) in other.statuses {
             *self.statuses.entry(status).or_default() += count;
         }
@@ -330,112 +329,169 @@ fn whole_answer(buffer: &[u8]) -> anyhow::Result<Option<u16>> {
     Ok((buffer.len() >= head + 4 + length).then_some(status))
 }
 
-/// One thread for each connection, which sleeps until its next request is due: an async runtime's
-/// timers tick in milliseconds, and would send everything at the tick.
-fn threads(count: u32, work: impl Fn(u32) -> anyhow::Result<Seen> + Send + Sync) -> anyhow::Result<Seen> {
-    std::thread::scope(|scope| {
-        let work = &work;
-        let threads: Vec<_> = (0..count)
-            .map(|number| {
-                std::thread::Builder::new()
-                    .stack_size(256 << 10)
-                    .spawn_scoped(scope, move || work(number))
-            })
-            .collect::<Result<_, _>>()?;
-        let mut all = Seen::default();
-        for thread in threads {
-            let seen = thread
-                .join()
-                .map_err(|_| anyhow::anyhow!("a thread panicked"))??;
-            all.add(seen);
-        }
-        Ok(all)
-    })
+/// Something that is sent and answered on a connection that does not block.
+trait Exchange {
+    fn send(&mut self) -> anyhow::Result<()>;
+    /// The answer's status, once it is there.
+    fn poll(&mut self) -> anyhow::Result<Option<u16>>;
 }
 
-/// Sleeps until something is due, and notes how late it woke.
-fn wait_until(due: Instant, seen: &mut Seen) {
-    if let Some(left) = due.checked_duration_since(Instant::now()) {
-        std::thread::sleep(left);
+/// When latencies begin.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Counted {
+    FromDue,
+    FromSent,
+}
+
+/// Exchanges on a schedule, evenly spread, from one thread that never sleeps: timers tick, all that
+/// is due at a tick would be sent at once, and waking up takes longer than most answers.
+fn on_schedule<E: Exchange>(
+    exchanges: Vec<E>,
+    period: Duration,
+    seconds: f64,
+    counted: Counted,
+) -> anyhow::Result<Seen> {
+    let begun = Instant::now() + Duration::from_millis(10);
+    let end = begun + Duration::from_secs_f64(seconds);
+    let count = exchanges.len() as f64;
+    // Each with when it is due next, and from when an open one counts.
+    let mut turns: Vec<(E, Instant, Option<Instant>)> = exchanges
+        .into_iter()
+        .enumerate()
+        .map(|(number, exchange)| (exchange, begun + period.mul_f64(number as f64 / count), None))
+        .collect();
+    let mut seen = Seen::default();
+    loop {
+        let mut is_open = false;
+        for (exchange, due, open) in &mut turns {
+            if let Some(since) = *open {
+                is_open = true;
+                if let Some(status) = exchange.poll()? {
+                    *seen.statuses.entry(status).or_default() += 1;
+                    seen.latencies_us.push(since.elapsed().as_secs_f32() * 1e6);
+                    *open = None;
+                }
+            } else if *due < end {
+                is_open = true;
+                let now = Instant::now();
+                if now >= *due {
+                    seen.late_us.push((now - *due).as_secs_f32() * 1e6);
+                    *open = Some(if counted == Counted::FromDue { *due } else { now });
+                    *due += period;
+                    exchange.send()?;
+                }
+            }
+        }
+        if !is_open {
+            return Ok(seen);
+        }
     }
-    seen.late_us.push(due.elapsed().as_secs_f32() * 1e6);
+}
+
+struct Http<'r> {
+    socket: std::net::TcpStream,
+    request: &'r [u8],
+    buffer: Vec<u8>,
+}
+
+impl Exchange for Http<'_> {
+    fn send(&mut self) -> anyhow::Result<()> {
+        self.buffer.clear();
+        Ok(self.socket.write_all(self.request)?)
+    }
+
+    fn poll(&mut self) -> anyhow::Result<Option<u16>> {
+        let mut piece = [0; 4096];
+        match self.socket.read(&mut piece) {
+            Ok(0) => bail!("the server closed the connection"),
+            Ok(count) => {
+                self.buffer.extend_from_slice(&piece[..count]);
+                whole_answer(&self.buffer)
+            }
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
 }
 
 /// Requests on a schedule (`rate` per second of all connections); latencies count from when a request
 /// was due.
 fn open_loop(address: &str, connections: u32, seconds: f64, rate: f64, request: &[u8]) -> anyhow::Result<()> {
+    let exchanges = (0..connections)
+        .map(|_| {
+            let socket = std::net::TcpStream::connect(address)?;
+            socket.set_nodelay(true)?;
+            socket.set_nonblocking(true)?;
+            let buffer = Vec::new();
+            Ok(Http {
+                socket,
+                request,
+                buffer,
+            })
+        })
+        .collect::<std::io::Result<Vec<_>>>()?;
     let period = Duration::from_secs_f64(f64::from(connections) / rate);
-    let begun = Instant::now() + Duration::from_millis(100);
-    let end = begun + Duration::from_secs_f64(seconds);
-    let all = threads(connections, |number| {
-        let mut socket = std::net::TcpStream::connect(address)?;
-        socket.set_nodelay(true)?;
-        let mut seen = Seen::default();
-        let mut buffer = Vec::with_capacity(1 << 14);
-        let mut piece = [0; 1 << 14];
-        let mut due = begun + period.mul_f64(f64::from(number) / f64::from(connections));
-        while due < end {
-            wait_until(due, &mut seen);
-            socket.write_all(request)?;
-            buffer.clear();
-            let status = loop {
-                let count = socket.read(&mut piece)?;
-                ensure!(count > 0, "the server closed the connection");
-                buffer.extend_from_slice(&piece[..count]);
-                if let Some(status) = whole_answer(&buffer)? {
-                    break status;
-                }
-            };
-            seen.note(status, due);
-            due += period;
-        }
-        Ok(seen)
-    })?;
+    let all = on_schedule(exchanges, period, seconds, Counted::FromDue)?;
     println!("{}", report(all, seconds));
     Ok(())
 }
 
+struct Live<'s> {
+    socket: WebSocket<std::net::TcpStream>,
+    samples: &'s [f64],
+    width: usize,
+    step: u64,
+}
+
+impl Exchange for Live<'_> {
+    fn send(&mut self) -> anyhow::Result<()> {
+        let mut frame = self.step.to_le_bytes().to_vec();
+        let row = usize::try_from(self.step % 512)? * self.width;
+        let sample = &self.samples[row..row + self.width];
+        frame.extend(sample.iter().flat_map(|v| v.to_le_bytes()));
+        Ok(self.socket.send(Message::binary(frame))?)
+    }
+
+    fn poll(&mut self) -> anyhow::Result<Option<u16>> {
+        let answer = match self.socket.read() {
+            Ok(answer) => answer.into_data(),
+            Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::WouldBlock => return Ok(None),
+            Err(error) => return Err(error.into()),
+        };
+        ensure!(
+            answer.get(..8) == Some(&self.step.to_le_bytes()),
+            "the answer is for another step"
+        );
+        self.step += 1;
+        Ok(Some(u16::from(answer[8])))
+    }
+}
+
 /// Live sessions, each with its own schedule; round trips count from when a sample was sent.
 fn stream(address: &str, model: &str, sessions: u32, rate: f64, seconds: f64) -> anyhow::Result<()> {
-    let period = Duration::from_secs_f64(1.0 / rate);
     let url = format!("ws://{address}/v1/models/{model}/stream");
     let samples = signal(0, 512);
-    let begun = Instant::now() + Duration::from_secs_f64(0.5 + f64::from(sessions) * 1e-3);
-    let end = begun + Duration::from_secs_f64(seconds);
-    let all = threads(sessions, |number| {
+    let mut exchanges = Vec::new();
+    for _ in 0..sessions {
         let socket = std::net::TcpStream::connect(address)?;
         socket.set_nodelay(true)?;
         let (mut socket, _) = client(url.as_str(), socket).map_err(|error| anyhow::anyhow!("{error}"))?;
         let opened = socket.read()?;
         let opened: StreamOpened = serde_json::from_str(opened.to_text()?)?;
-        let width = opened.inputs.len();
-        let mut due = begun + period.mul_f64(f64::from(number) / f64::from(sessions));
-        let mut seen = Seen::default();
-        let mut step = 0_u64;
-        while due < end {
-            wait_until(due, &mut seen);
-            due += period;
-            let mut frame = step.to_le_bytes().to_vec();
-            let row = usize::try_from(step % 512)?;
-            frame.extend(
-                samples[row * width..(row + 1) * width]
-                    .iter()
-                    .flat_map(|v| v.to_le_bytes()),
-            );
-            let sent = Instant::now();
-            socket.send(Message::binary(frame))?;
-            let answer = socket.read()?.into_data();
-            ensure!(
-                answer.get(..8) == Some(&step.to_le_bytes()),
-                "the answer is for another step"
-            );
-            *seen.statuses.entry(u16::from(answer[8])).or_default() += 1;
-            seen.latencies_us.push(sent.elapsed().as_secs_f32() * 1e6);
-            step += 1;
-        }
-        socket.close(None)?;
-        Ok(seen)
-    })?;
+        socket.get_ref().set_nonblocking(true)?;
+        exchanges.push(Live {
+            socket,
+            samples: &samples,
+            width: opened.inputs.len(),
+            step: 0,
+        });
+    }
+    let all = on_schedule(
+        exchanges,
+        Duration::from_secs_f64(1.0 / rate),
+        seconds,
+        Counted::FromSent,
+    )?;
     println!("{}", report(all, seconds));
     Ok(())
 }

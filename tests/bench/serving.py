@@ -383,7 +383,9 @@ def over_http(bench, ours, rounds, seconds):
                     if binary_ours and server is not ours:
                         continue
                     found = load(bench, server, request_file(bench, server, windows, binary_ours), 16, seconds)
-                    assert set(found["statuses"]) == {"200"}, (server.name, found)
+                    # Where others take the cores for a moment, our gate refuses some of what would wait too long.
+                    refused = found["statuses"].pop("429", 0)
+                    assert set(found["statuses"]) == {"200"} and refused <= 0.02 * found["answers"], (server.name, refused, found)
                     samples[server.name].append(found)
             for server in servers:
                 if samples[server.name]:
@@ -545,12 +547,13 @@ def long_recording(bench, rows):
         server = start_ours(bench)
         try:
             if limit < rows:
-                part = bench.folder / "part.parquet"
-                pyarrow.parquet.write_table(pyarrow.parquet.ParquetFile(path).read_row_group(0).slice(0, limit), part)
+                part, left = bench.folder / "part.parquet", limit
                 with pyarrow.parquet.ParquetWriter(part, pyarrow.parquet.read_schema(path)) as writer:
-                    file = pyarrow.parquet.ParquetFile(path)
-                    for group in range(limit // 500_000):
-                        writer.write_table(file.read_row_group(group))
+                    for batch in pyarrow.parquet.ParquetFile(path).iter_batches(500_000):
+                        writer.write_batch(batch.slice(0, left))
+                        left -= min(left, batch.num_rows)
+                        if left == 0:
+                            break
             source = path if limit == rows else part
             begun = time.monotonic()
             connection = http.client.HTTPConnection(server.address, timeout=600)
@@ -577,10 +580,18 @@ def report(results, arguments):
     def us(value):
         return f"{value:.2f}" if value < 10 else f"{value:,.0f}"
 
+    def warned(runs):
+        """Latencies of a client that was held up itself are nobody's figure."""
+        late = max(run["late_p99_us"] for run in runs)
+        if late < 1000:
+            return []
+        return ["", f"**Not a measurement of the service's latency**: the client was up to {late / 1000:,.0f} ms behind its own schedule (p99), because "
+                "other programs had the cores. To be repeated on a quiet machine; what counts here are CPU time and memory."]
+
     lines = [
         "# Speed of predictions", "",
         "Made by `tests/bench/serving.py` (its head says how; `--only PART` for one part). Windows of 60 steps of 5 sensors, one target, "
-        f"random weights; medians of {arguments.rounds} rounds in which everything compared runs in turn.", "",
+        f"random weights; medians of up to {arguments.rounds} rounds in which everything compared runs in turn.", "",
         f"Machine: {machine()}. Other programs ran on it meanwhile (load average {results.get('load', 'unknown')} "
         "at the end of each part): compare ratios.",
     ]
@@ -589,7 +600,8 @@ def report(results, arguments):
         lines += [
             "", "## In process, one thread, µs of CPU per call (`--only kernel`)", "",
             "*Network*: f32 in, f32 out, onnxruntime with a plain graph. *Prediction*: samples in engineering units in, estimates out, "
-            "onnxruntime with our `model.onnx`, which holds the scales."
+            "onnxruntime with our `model.onnx`, which holds the scales. `best` has a skip connection with constant coefficients here; coefficients that "
+            "follow the pose are not measured."
             + ("" if torch else " torch is not installed here, so there is no column for it; the script fills one where it is."), "",
             "| structure | batch | network: ours | onnxruntime | ratio | prediction: ours | onnxruntime | ratio |" + (" torch | ratio |" if torch else ""),
             "|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
@@ -615,19 +627,24 @@ def report(results, arguments):
                   "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | of that, client late by (p99) µs |", "|---|---|---|---|---|---|"]
         lines += [f"| {name} | {f['rate']:.0f} | {us(f['p50_us'])} | {us(f['p99_us'])} | {us(f['best_p99_us'])} | {us(f['late_p99_us'])} |"
                   for name, f in half.items()]
+        lines += warned(half.values())
     if over := results.get("overload"):
         lines += ["", "## Overload (`--only overload`)", "",
-                  "Each connection asks again as soon as it is answered, 20 ms after a refusal. Latencies of what was answered, as the client sees them: "
+                  "The gate refuses what would wait more than 25 ms behind what was read before it. It cannot count what nobody has read yet: with many large "
+                  "bodies at once, receiving them is what takes long, also those that are refused then. Each connection asks again as soon as it is answered, 20 ms after a refusal. Latencies of what was answered, as the client sees them: "
                   "with thousands of connections its own queue is in them.", "",
                   "| windows | body | connections | answers/s | answered | refused with 429 | p50 ms | p99 ms |", "|---|---|---|---|---|---|---|---|"]
         lines += [f"| {o['windows']} | {o['body']} | {o['connections']} | {o['per_second']:.0f} | {o['answered']:,} | {o['refused']:,} | "
                   f"{o['p50_us'] / 1e3:.1f} | {o['p99_us'] / 1e3:.1f} |" for o in over]
     if found := results.get("streams"):
         lines += ["", "## Live sessions (`--only streams`)", "",
-                  "| sessions | samples/s each | estimates/s | round trip p50 µs | p99 µs | CPU µs per sample | memory early, MB | late |",
-                  "|---|---|---|---|---|---|---|---|"]
-        lines += [f"| {s['sessions']:,} | {s['rate']} | {s['per_second']:.0f} | {us(s['p50_us'])} | {us(s['p99_us'])} | {s['cpu_us']:.1f} | "
-                  f"{s['early_mb']:.1f} | {s['late_mb']:.1f} |" for s in found]
+                  "One client thread that never sleeps sends every sample when it is due; where it comes later itself, others had its core, and "
+                  "the round trips are theirs as much as ours.", "",
+                  "| sessions | samples/s each | round trip p50 µs | p99 µs | client late by p50 µs | p99 µs | CPU µs of the service per sample | memory early, MB | late |",
+                  "|---|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {s['sessions']:,} | {s['rate']} | {us(s['p50_us'])} | {us(s['p99_us'])} | {us(s['late_p50_us'])} | {us(s['late_p99_us'])} | "
+                  f"{s['cpu_us']:.1f} | {s['early_mb']:.1f} | {s['late_mb']:.1f} |" for s in found]
+        lines += warned(found)
     if recording := results.get("recording"):
         lines += ["", "## A long recording as Parquet (`--only recording`)", "", "A fresh service for each.", "",
                   "| rows | seconds | CPU s of the service | sent MB | received MB | peak memory of the service, MB |", "|---|---|---|---|---|---|"]
@@ -635,10 +652,14 @@ def report(results, arguments):
     if speed := results.get("felt"):
         lines += ["", "## A manoeuvre of one second (`--only felt`)", "",
                   "*Simulated*: ms per run on one core, median over the payloads of [benchmark-simulator.md](benchmark-simulator.md). *Estimated*: the same "
-                  "200 samples, an estimate for each, columns in and columns out; and, as the paper counts, one window of a batch of 4,096 for each run.", "",
+                  "200 samples, an estimate for each, columns in and columns out; and, as the paper counts, one window of a batch of 4,096 for each run. "
+                  "One core throughout; no GPU was at hand.", "",
                   "| | ms | " + " | ".join(f"times {s}, {us(speed['networks'][s])} µs" for s in ("RLR", "best")) + " | times one window of RLR in a batch, "
                   f"{us(speed['batches']['RLR'])} µs |", "|---|---|---|---|---|"]
-        lines += [f"| {name} | {value / 1e3:.3g} | {value / speed['networks']['RLR']:,.0f} | {value / speed['networks']['best']:,.0f} | "
+        def times(ratio):
+            return f"{ratio:,.0f}" if ratio >= 10 else f"{ratio:.1f}"
+
+        lines += [f"| {name} | {value / 1e3:,.4g} | {times(value / speed['networks']['RLR'])} | {times(value / speed['networks']['best'])} | "
                   f"{value / speed['batches']['RLR']:.1e} |" for name, value in speed["simulated"].items()]
     if (mem := results.get("memory")) or results.get("restart"):
         lines += ["", "## Holding on", ""]
@@ -667,7 +688,7 @@ def main():
     parser.add_argument("--seconds", type=float, default=3, help="of each load")
     parser.add_argument("--rows", type=int, default=10_000_000, help="of the long recording")
     parser.add_argument("--requests", type=int, default=1_000_000, help="of the memory part")
-    parser.add_argument("--only", choices=PARTS, action="append")
+    parser.add_argument("--only", choices=[*PARTS, "nothing"], action="append", help="`nothing`: the report from --results")
     parser.add_argument("--results", help="file of measured numbers; parts that are not measured now are taken from it")
     arguments = parser.parse_args()
     results = {}
@@ -696,6 +717,8 @@ def main():
             "restart": lambda: restart(bench, os.path.abspath(arguments.hydroflex), arguments.rounds),
         }
         for part in arguments.only or PARTS:
+            if part == "nothing":
+                continue
             results[part] = measures[part]()
             loads[part] = round(os.getloadavg()[0], 1)
             if arguments.results:
