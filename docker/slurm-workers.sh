@@ -5,7 +5,7 @@
 #   sbatch docker/slurm-workers.sh s3://bucket/prefix
 #
 # The coordinator runs elsewhere, on a host that stays up. Cancel or lose any task at any time: its shard goes
-# to another worker. Untried on a cluster.
+# to another worker. Tried with Slurm 22.05 on one node (submitted, worked, drained by scancel); untried on a cluster.
 #SBATCH --job-name=hydroflex
 #SBATCH --array=1-32
 #SBATCH --cpus-per-task=4

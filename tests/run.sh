@@ -32,7 +32,8 @@ if ! $rust_only; then
     say "Python packages"
     venv=target/test-venv
     if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
-    "$venv/bin/pip" install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+    # Not the pip script: it names the place where the environment was made, which a copy is not.
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
     # An S3 server for the Rust tests.
     export HYDROFLEX_MOTO="$PWD/$venv/bin/moto_server"
 fi

@@ -11,8 +11,8 @@ use arrow::array::{
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Schema, UInt64Type};
 use arrow::error::ArrowError;
+use hydroflex_dataset::guard;
 use hydroflex_openapi::channel::{Channel, ChannelRole};
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::errors::ParquetError;
@@ -110,7 +110,7 @@ pub fn read_parquet(
         path: path.to_owned(),
         source,
     })?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(parquet_error)?;
+    let builder = guard::open_parquet(file).map_err(parquet_error)?;
     let schema = Arc::clone(builder.schema());
     for name in names.iter().map(String::as_str).chain(["run_id", "step"]) {
         if schema.index_of(name).is_err() {
@@ -128,7 +128,7 @@ pub fn read_parquet(
         (names.contains(name) || ["run_id", "step", "time_s"].contains(&name.as_str())).then_some(i)
     });
     let mask = ProjectionMask::roots(builder.parquet_schema(), wanted);
-    let reader = builder.with_projection(mask).build().map_err(parquet_error)?;
+    let reader = guard::batches(builder.with_projection(mask)).map_err(parquet_error)?;
     let mut runs: Vec<RunSamples> = Vec::new();
     let mut sample_time_s = None;
     let mut first_time = 0.0;

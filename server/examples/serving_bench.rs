@@ -15,7 +15,6 @@
 mod register;
 
 use anyhow::{Context, bail, ensure};
-use futures::{SinkExt, StreamExt};
 use hydroflex_ledger::Ledger;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ml::model::Model;
@@ -25,14 +24,13 @@ use hydroflex_server::coordinator::{Coordinator, CoordinatorConfig};
 use hydroflex_server::http::AppState;
 use serde_json::json;
 use std::collections::HashMap;
-use std::io::{BufRead, Write};
+use std::io::{BufRead, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio_tungstenite::client_async;
-use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::{Message, client};
 use tokio_util::sync::CancellationToken;
 
 fn main() -> anyhow::Result<()> {
@@ -41,25 +39,34 @@ fn main() -> anyhow::Result<()> {
     match arguments.as_slice() {
         ["write", structure, folder] => write(structure, Path::new(folder)),
         ["kernel"] => kernel(),
+        ["series", folder, rows, calls] => series(Path::new(folder), rows.parse()?, calls.parse()?),
         ["serve", folder] => run(serve(PathBuf::from(folder))),
-        ["load", address, connections, seconds, rate, request] => {
+        ["register", folder, data] => run(register_into(PathBuf::from(folder), PathBuf::from(data))),
+        ["open-loop", address, connections, seconds, rate, request] => {
+            let request = std::fs::read(request).context("the request file")?;
+            open_loop(
+                address,
+                connections.parse()?,
+                seconds.parse()?,
+                rate.parse()?,
+                &request,
+            )
+        }
+        ["load", address, connections, seconds, request] => {
             let request = std::fs::read(request).context("the request file")?;
             run(load(
                 (*address).to_owned(),
                 connections.parse()?,
                 seconds.parse()?,
-                rate.parse()?,
                 request,
             ))
         }
-        ["stream", address, model, sessions, rate, seconds] => run(stream(
-            address,
-            model,
-            sessions.parse()?,
-            rate.parse()?,
-            seconds.parse()?,
-        )),
-        other => bail!("unknown arguments {other:?}: write, kernel, serve, load or stream"),
+        ["stream", address, model, sessions, rate, seconds] => {
+            stream(address, model, sessions.parse()?, rate.parse()?, seconds.parse()?)
+        }
+        other => bail!(
+            "unknown arguments {other:?}: write, kernel, series, serve, register, load, open-loop or stream"
+        ),
     }
 }
 
@@ -81,6 +88,8 @@ fn write(structure: &str, folder: &Path) -> anyhow::Result<()> {
 /// Time that this thread has computed. Unlike the time of day it does not count what others compute
 /// meanwhile.
 fn computed() -> anyhow::Result<Duration> {
+    // Brings the system's count up to date, which otherwise happens every few milliseconds.
+    std::thread::yield_now();
     let text = std::fs::read_to_string("/proc/thread-self/schedstat")?;
     let nanoseconds = text.split(' ').next().context("a time")?;
     Ok(Duration::from_nanos(nanoseconds.parse()?))
@@ -135,6 +144,39 @@ fn kernel() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A recording through the network, as a user has it: columns in, columns out; µs of CPU per call.
+fn series(folder: &Path, rows: usize, calls: u32) -> anyhow::Result<()> {
+    let model = Model::load(folder)?;
+    let predictor = model.predictor();
+    let mut workspace = predictor.workspace();
+    let samples = signal(0, rows);
+    let width = predictor.input_count();
+    let columns: Vec<Vec<f64>> = (0..width)
+        .map(|input| samples.iter().skip(input).step_by(width).copied().collect())
+        .collect();
+    let columns: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+    let mut estimates = 0;
+    let begun = computed()?;
+    for _ in 0..calls {
+        let found = predictor.predict_series_with(std::hint::black_box(&columns), &mut workspace);
+        estimates = found.columns[0].len();
+    }
+    let us = (computed()? - begun).as_secs_f64() * 1e6 / f64::from(calls);
+    println!("{}", json!({ "us": us, "estimates": estimates }));
+    Ok(())
+}
+
+/// A data directory of `hydroflex serve` with one model in it.
+async fn register_into(folder: PathBuf, data: PathBuf) -> anyhow::Result<()> {
+    std::fs::create_dir_all(&data)?;
+    let url = format!("sqlite:{}", data.join("ledger.sqlite").display());
+    let ledger = Ledger::create(&url).await?;
+    let blobs = Blobs::directory(&data.join("store"))?;
+    let model = register::register_folder(&ledger, &blobs, &folder).await;
+    println!("{}", json!({ "model": model }));
+    Ok(())
+}
+
 /// A service around one model, without workers, until standard input ends.
 async fn serve(folder: PathBuf) -> anyhow::Result<()> {
     let data = tempfile::tempdir()?;
@@ -172,100 +214,89 @@ async fn serve(folder: PathBuf) -> anyhow::Result<()> {
 #[derive(Default)]
 struct Seen {
     latencies_us: Vec<f32>,
+    /// How late this program itself was, where it keeps to a schedule.
+    late_us: Vec<f32>,
     statuses: HashMap<u16, u64>,
 }
 
-/// Sends one request over and over on every connection; with a rate (requests per second of all
-/// connections), on a schedule, and latencies count from when a request was due.
-async fn load(
-    address: String,
-    connections: u32,
-    seconds: f64,
-    rate: f64,
-    request: Vec<u8>,
-) -> anyhow::Result<()> {
+impl Seen {
+    fn add(&mut self, other: Self) {
+        self.latencies_us.extend(other.latencies_us);
+        self.late_us.extend(other.late_us);
+        for (status, count) in other.statuses {
+            *self.statuses.entry(status).or_default() += count;
+        }
+    }
+
+    fn note(&mut self, status: u16, begun: Instant) {
+        *self.statuses.entry(status).or_default() += 1;
+        if status == 200 {
+            self.latencies_us.push(begun.elapsed().as_secs_f32() * 1e6);
+        }
+    }
+}
+
+/// Sends one request over and over on every connection.
+async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>) -> anyhow::Result<()> {
     let request = Arc::new(request);
+    let mut sockets = Vec::new();
+    for _ in 0..connections {
+        let socket = TcpStream::connect(&address).await?;
+        socket.set_nodelay(true)?;
+        sockets.push(socket);
+    }
     let begun = Instant::now();
     let end = begun + Duration::from_secs_f64(seconds);
-    let tasks: Vec<_> = (0..connections)
-        .map(|number| {
-            let (address, request) = (address.clone(), request.clone());
-            let period = (rate > 0.0).then(|| Duration::from_secs_f64(f64::from(connections) / rate));
-            let first = begun
-                + period
-                    .unwrap_or_default()
-                    .mul_f64(f64::from(number) / f64::from(connections));
-            tokio::spawn(async move { connection(&address, &request, first, period, end).await })
+    let tasks: Vec<_> = sockets
+        .into_iter()
+        .map(|mut socket| {
+            let request = request.clone();
+            tokio::spawn(async move {
+                let mut seen = Seen::default();
+                let mut buffer = Vec::with_capacity(1 << 14);
+                loop {
+                    let begun = Instant::now();
+                    if begun >= end {
+                        return anyhow::Ok(seen);
+                    }
+                    let status = exchange(&mut socket, &request, &mut buffer).await?;
+                    seen.note(status, begun);
+                    if status == 429 {
+                        // A client that asks again at once is no client.
+                        tokio::time::sleep(Duration::from_millis(20)).await;
+                    }
+                }
+            })
         })
         .collect();
     let mut all = Seen::default();
     for task in tasks {
-        let seen = task.await??;
-        all.latencies_us.extend(seen.latencies_us);
-        for (status, count) in seen.statuses {
-            *all.statuses.entry(status).or_default() += count;
-        }
+        all.add(task.await??);
     }
     let elapsed = begun.elapsed().as_secs_f64();
     println!("{}", report(all, elapsed));
     Ok(())
 }
 
+fn quantile(sorted: &[f32], q: f64) -> f32 {
+    let place = (q * sorted.len() as f64) as usize;
+    sorted
+        .get(place.min(sorted.len().saturating_sub(1)))
+        .copied()
+        .unwrap_or(f32::NAN)
+}
+
 fn report(mut all: Seen, elapsed: f64) -> serde_json::Value {
     all.latencies_us.sort_by(f32::total_cmp);
+    all.late_us.sort_by(f32::total_cmp);
     let count = all.latencies_us.len();
-    let quantile = |q: f64| {
-        let place = (q * count as f64) as usize;
-        all.latencies_us
-            .get(place.min(count.saturating_sub(1)))
-            .copied()
-            .unwrap_or(f32::NAN)
-    };
+    let latency = |q: f64| quantile(&all.latencies_us, q);
     json!({
         "seconds": elapsed, "answers": count, "per_second": count as f64 / elapsed,
-        "p50_us": quantile(0.5), "p99_us": quantile(0.99), "p999_us": quantile(0.999),
+        "p50_us": latency(0.5), "p99_us": latency(0.99), "p999_us": latency(0.999),
+        "late_p50_us": quantile(&all.late_us, 0.5), "late_p99_us": quantile(&all.late_us, 0.99),
         "statuses": all.statuses.into_iter().map(|(s, n)| (s.to_string(), json!(n))).collect::<serde_json::Map<_, _>>(),
     })
-}
-
-async fn connection(
-    address: &str,
-    request: &[u8],
-    first: Instant,
-    period: Option<Duration>,
-    end: Instant,
-) -> anyhow::Result<Seen> {
-    let mut socket = TcpStream::connect(address).await?;
-    socket.set_nodelay(true)?;
-    let mut seen = Seen::default();
-    let mut buffer = Vec::with_capacity(1 << 16);
-    let mut due = first;
-    loop {
-        if let Some(period) = period {
-            tokio::time::sleep_until(due.into()).await;
-            if Instant::now() >= end {
-                return Ok(seen);
-            }
-            let begun = due;
-            due += period;
-            let status = exchange(&mut socket, request, &mut buffer).await?;
-            note(&mut seen, status, begun);
-        } else {
-            let begun = Instant::now();
-            if begun >= end {
-                return Ok(seen);
-            }
-            let status = exchange(&mut socket, request, &mut buffer).await?;
-            note(&mut seen, status, begun);
-        }
-    }
-}
-
-fn note(seen: &mut Seen, status: u16, begun: Instant) {
-    *seen.statuses.entry(status).or_default() += 1;
-    if status == 200 {
-        seen.latencies_us.push(begun.elapsed().as_secs_f32() * 1e6);
-    }
 }
 
 /// One request and its whole answer; returns the status.
@@ -277,86 +308,134 @@ async fn exchange(socket: &mut TcpStream, request: &[u8], buffer: &mut Vec<u8>) 
             socket.read_buf(buffer).await? > 0,
             "the server closed the connection"
         );
-        let Some(head) = buffer.windows(4).position(|four| four == b"\r\n\r\n") else {
-            continue;
-        };
-        let text = std::str::from_utf8(&buffer[..head])?.to_ascii_lowercase();
-        let status: u16 = text.get(9..12).context("a status")?.parse()?;
-        let length: usize = text
-            .lines()
-            .find_map(|line| line.strip_prefix("content-length:"))
-            .context("an answer with content-length")?
-            .trim()
-            .parse()?;
-        while buffer.len() < head + 4 + length {
-            ensure!(
-                socket.read_buf(buffer).await? > 0,
-                "the server closed the connection"
-            );
+        if let Some(status) = whole_answer(buffer)? {
+            return Ok(status);
         }
-        return Ok(status);
     }
 }
 
-/// Live sessions, each with its own schedule; round trips count from when a sample was sent.
-async fn stream(address: &str, model: &str, sessions: u32, rate: f64, seconds: f64) -> anyhow::Result<()> {
-    let period = Duration::from_secs_f64(1.0 / rate);
-    let mut sockets = Vec::new();
-    for _ in 0..sessions {
-        let socket = TcpStream::connect(address).await?;
-        socket.set_nodelay(true)?;
-        let url = format!("ws://{address}/v1/models/{model}/stream");
-        let (mut socket, _) = client_async(url, socket).await?;
-        let opened = socket.next().await.context("the first message")??;
-        let opened: StreamOpened = serde_json::from_str(opened.to_text()?)?;
-        sockets.push((socket, opened.inputs.len()));
+/// The status of an answer that has come whole.
+fn whole_answer(buffer: &[u8]) -> anyhow::Result<Option<u16>> {
+    let Some(head) = buffer.windows(4).position(|four| four == b"\r\n\r\n") else {
+        return Ok(None);
+    };
+    let text = std::str::from_utf8(&buffer[..head])?.to_ascii_lowercase();
+    let status: u16 = text.get(9..12).context("a status")?.parse()?;
+    let length: usize = text
+        .lines()
+        .find_map(|line| line.strip_prefix("content-length:"))
+        .context("an answer with content-length")?
+        .trim()
+        .parse()?;
+    Ok((buffer.len() >= head + 4 + length).then_some(status))
+}
+
+/// One thread for each connection, which sleeps until its next request is due: an async runtime's
+/// timers tick in milliseconds, and would send everything at the tick.
+fn threads(count: u32, work: impl Fn(u32) -> anyhow::Result<Seen> + Send + Sync) -> anyhow::Result<Seen> {
+    std::thread::scope(|scope| {
+        let work = &work;
+        let threads: Vec<_> = (0..count)
+            .map(|number| {
+                std::thread::Builder::new()
+                    .stack_size(256 << 10)
+                    .spawn_scoped(scope, move || work(number))
+            })
+            .collect::<Result<_, _>>()?;
+        let mut all = Seen::default();
+        for thread in threads {
+            let seen = thread
+                .join()
+                .map_err(|_| anyhow::anyhow!("a thread panicked"))??;
+            all.add(seen);
+        }
+        Ok(all)
+    })
+}
+
+/// Sleeps until something is due, and notes how late it woke.
+fn wait_until(due: Instant, seen: &mut Seen) {
+    if let Some(left) = due.checked_duration_since(Instant::now()) {
+        std::thread::sleep(left);
     }
+    seen.late_us.push(due.elapsed().as_secs_f32() * 1e6);
+}
+
+/// Requests on a schedule (`rate` per second of all connections); latencies count from when a request
+/// was due.
+fn open_loop(address: &str, connections: u32, seconds: f64, rate: f64, request: &[u8]) -> anyhow::Result<()> {
+    let period = Duration::from_secs_f64(f64::from(connections) / rate);
     let begun = Instant::now() + Duration::from_millis(100);
     let end = begun + Duration::from_secs_f64(seconds);
-    let tasks: Vec<_> = sockets
-        .into_iter()
-        .enumerate()
-        .map(|(number, (mut socket, width))| {
-            tokio::spawn(async move {
-                let mut due = begun + period.mul_f64(number as f64 / f64::from(sessions));
-                let mut seen = Seen::default();
-                let samples = signal(0, 512);
-                for step in 0_u64.. {
-                    tokio::time::sleep_until(due.into()).await;
-                    due += period;
-                    let sent = Instant::now();
-                    if sent >= end {
-                        break;
-                    }
-                    let mut frame = step.to_le_bytes().to_vec();
-                    let row = usize::try_from(step % 512)?;
-                    frame.extend(
-                        samples[row * width..(row + 1) * width]
-                            .iter()
-                            .flat_map(|v| v.to_le_bytes()),
-                    );
-                    socket.send(Message::binary(frame)).await?;
-                    let answer = socket.next().await.context("an answer")??.into_data();
-                    ensure!(
-                        answer.get(..8) == Some(&step.to_le_bytes()),
-                        "the answer is for another step"
-                    );
-                    *seen.statuses.entry(u16::from(answer[8])).or_default() += 1;
-                    seen.latencies_us.push(sent.elapsed().as_secs_f32() * 1e6);
+    let all = threads(connections, |number| {
+        let mut socket = std::net::TcpStream::connect(address)?;
+        socket.set_nodelay(true)?;
+        let mut seen = Seen::default();
+        let mut buffer = Vec::with_capacity(1 << 14);
+        let mut piece = [0; 1 << 14];
+        let mut due = begun + period.mul_f64(f64::from(number) / f64::from(connections));
+        while due < end {
+            wait_until(due, &mut seen);
+            socket.write_all(request)?;
+            buffer.clear();
+            let status = loop {
+                let count = socket.read(&mut piece)?;
+                ensure!(count > 0, "the server closed the connection");
+                buffer.extend_from_slice(&piece[..count]);
+                if let Some(status) = whole_answer(&buffer)? {
+                    break status;
                 }
-                socket.close(None).await?;
-                anyhow::Ok(seen)
-            })
-        })
-        .collect();
-    let mut all = Seen::default();
-    for task in tasks {
-        let seen = task.await??;
-        all.latencies_us.extend(seen.latencies_us);
-        for (status, count) in seen.statuses {
-            *all.statuses.entry(status).or_default() += count;
+            };
+            seen.note(status, due);
+            due += period;
         }
-    }
-    println!("{}", report(all, begun.elapsed().as_secs_f64()));
+        Ok(seen)
+    })?;
+    println!("{}", report(all, seconds));
+    Ok(())
+}
+
+/// Live sessions, each with its own schedule; round trips count from when a sample was sent.
+fn stream(address: &str, model: &str, sessions: u32, rate: f64, seconds: f64) -> anyhow::Result<()> {
+    let period = Duration::from_secs_f64(1.0 / rate);
+    let url = format!("ws://{address}/v1/models/{model}/stream");
+    let samples = signal(0, 512);
+    let begun = Instant::now() + Duration::from_secs_f64(0.5 + f64::from(sessions) * 1e-3);
+    let end = begun + Duration::from_secs_f64(seconds);
+    let all = threads(sessions, |number| {
+        let socket = std::net::TcpStream::connect(address)?;
+        socket.set_nodelay(true)?;
+        let (mut socket, _) = client(url.as_str(), socket).map_err(|error| anyhow::anyhow!("{error}"))?;
+        let opened = socket.read()?;
+        let opened: StreamOpened = serde_json::from_str(opened.to_text()?)?;
+        let width = opened.inputs.len();
+        let mut due = begun + period.mul_f64(f64::from(number) / f64::from(sessions));
+        let mut seen = Seen::default();
+        let mut step = 0_u64;
+        while due < end {
+            wait_until(due, &mut seen);
+            due += period;
+            let mut frame = step.to_le_bytes().to_vec();
+            let row = usize::try_from(step % 512)?;
+            frame.extend(
+                samples[row * width..(row + 1) * width]
+                    .iter()
+                    .flat_map(|v| v.to_le_bytes()),
+            );
+            let sent = Instant::now();
+            socket.send(Message::binary(frame))?;
+            let answer = socket.read()?.into_data();
+            ensure!(
+                answer.get(..8) == Some(&step.to_le_bytes()),
+                "the answer is for another step"
+            );
+            *seen.statuses.entry(u16::from(answer[8])).or_default() += 1;
+            seen.latencies_us.push(sent.elapsed().as_secs_f32() * 1e6);
+            step += 1;
+        }
+        socket.close(None)?;
+        Ok(seen)
+    })?;
+    println!("{}", report(all, seconds));
     Ok(())
 }

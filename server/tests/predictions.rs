@@ -15,7 +15,9 @@ use hydroflex_ml::predict::synthetic::signal;
 use hydroflex_openapi::catalogue::{AliasInfo, AliasList};
 use hydroflex_openapi::inference::{InferError, InferResponse, ModelMetadata, ServerMetadata};
 use hydroflex_openapi::prediction::PredictResponse;
+use hydroflex_server::prediction::gate::{Gate, Work};
 use serde_json::{Value, json};
+use std::time::Duration;
 
 const INPUTS: [&str; 5] = [
     "valve_lift_ratio",
@@ -74,6 +76,35 @@ async fn a_recording_as_json_gives_estimates_with_intervals_flags_and_provenance
         }
     }
     assert_eq!(answer.inside_envelope.unwrap().len(), 9);
+}
+
+/// A service that lets nothing wait, and one request that takes long.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_busy_service_refuses_small_requests_at_once_and_says_when_to_ask_again() {
+    let desk = Desk::changed(1000, |state| state.behind_gate(Gate::new(2, Duration::ZERO))).await;
+    let id = desk.register(&synthetic("RLR", 1)).await;
+    let path = format!("/v1/models/{id}/predict");
+    let body = columns(20).to_string();
+    assert_eq!(desk.post(&path, &body).await.status, 200);
+    let other = desk.state.gate().inline(Work::Text, body.len()).await.unwrap();
+    let refused = desk.post(&path, &body).await;
+    assert_eq!(refused.status, 429);
+    assert_eq!(refused.headers["retry-after"], "1");
+    refused.problem(429);
+    let windows = json!({"inputs": [{"name": "window", "datatype": "FP64", "shape": [1, 12, 5], "data": signal(0, 12)}]});
+    let infer = format!("/v2/models/{id}/infer");
+    let refused = desk.post(&infer, &windows.to_string()).await;
+    assert_eq!(refused.status, 429);
+    assert_eq!(refused.headers["retry-after"], "1");
+    let said: InferError = refused.json();
+    assert!(
+        said.error.contains("as much as this machine can do"),
+        "{}",
+        said.error
+    );
+    drop(other);
+    assert_eq!(desk.post(&path, &body).await.status, 200);
+    assert_eq!(desk.post(&infer, &windows.to_string()).await.status, 200);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -356,6 +387,52 @@ async fn protocol_errors_name_what_is_wrong() {
         assert_eq!(answer.status, 404, "{path}");
         let error: InferError = answer.json();
         assert!(error.error.contains(says), "{path}: {}", error.error);
+    }
+}
+
+/// Whatever comes: an answer or a refusal, never a failure of the service.
+#[tokio::test(flavor = "multi_thread")]
+async fn damaged_requests_are_answered_or_refused_and_harm_nobody() {
+    let desk = Desk::new().await;
+    let id = desk.register(&synthetic("RLR", 2)).await;
+    let (request, samples) = infer_request(2);
+    let bytes: Vec<u8> = samples.iter().flat_map(|v| v.to_le_bytes()).collect();
+    let mut with_bytes = request.clone();
+    with_bytes["inputs"][0].as_object_mut().unwrap().remove("data");
+    with_bytes["inputs"][0]["parameters"] = json!({ "binary_data_size": bytes.len() });
+    let (body, length) = binary(&with_bytes, &bytes);
+    let (predict, infer) = (
+        format!("/v1/models/{id}/predict"),
+        format!("/v2/models/{id}/infer"),
+    );
+    let length = [("inference-header-content-length", length.as_str())];
+    let json = [("content-type", "application/json")];
+    let gzip = [("content-type", "application/json"), ("content-encoding", "gzip")];
+    let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut packed, request.to_string().as_bytes()).unwrap();
+    let packed = packed.finish().unwrap();
+    let kinds: [(&str, &[(&str, &str)], Vec<u8>); 4] = [
+        (&predict, &json, columns(20).to_string().into_bytes()),
+        (&infer, &json, request.to_string().into_bytes()),
+        (&infer, &length, body),
+        (&infer, &gzip, packed),
+    ];
+    for (path, headers, whole) in kinds {
+        let mut refused = 0;
+        for seed in 0..400 {
+            let answer = desk
+                .send("POST", path, headers, common::damaged(&whole, seed))
+                .await;
+            assert!(
+                answer.status == 200 || answer.status.is_client_error(),
+                "{path} {headers:?} seed {seed}: {}",
+                answer.status
+            );
+            refused += usize::from(answer.status != 200);
+        }
+        assert!(refused > 100, "{path} {headers:?}: only {refused} were refused");
+        let answer = desk.send("POST", path, headers, whole).await;
+        assert_eq!(answer.status, 200, "{path} {headers:?} afterwards");
     }
 }
 

@@ -267,6 +267,42 @@ async fn what_is_not_a_sample_is_told_and_changes_nothing() {
     assert_eq!(plain.problem(426).kind, "/problems/upgrade-required");
 }
 
+/// Every message gets one answer, and the session goes on.
+#[tokio::test(flavor = "multi_thread")]
+async fn damaged_samples_are_answered_one_by_one() {
+    let desk = Desk::new().await;
+    let id = desk.register(&synthetic("RLR", 1)).await;
+    let (mut client, opened) = Client::open(&desk, id.as_str()).await;
+    let inputs: serde_json::Map<String, serde_json::Value> = opened
+        .inputs
+        .iter()
+        .zip(signal(0, 1))
+        .map(|(name, value)| (name.clone(), json!(value)))
+        .collect();
+    let text = json!({ "step": 7, "inputs": inputs }).to_string();
+    let mut bytes = 7_u64.to_le_bytes().to_vec();
+    bytes.extend(signal(0, 1).iter().flat_map(|value| value.to_le_bytes()));
+    for seed in 0..300 {
+        let text = common::damaged(text.as_bytes(), seed);
+        let answer = client.text(String::from_utf8_lossy(&text).into_owned()).await;
+        assert!(answer.starts_with('{'), "seed {seed}: {answer}");
+        client
+            .0
+            .send(Message::binary(common::damaged(&bytes, seed)))
+            .await
+            .unwrap();
+        let answer = client.0.next().await.unwrap().unwrap();
+        assert!(answer.is_text() || answer.is_binary(), "seed {seed}: {answer:?}");
+    }
+    // After silence of more than a window the session begins anew.
+    for row in 0..STEPS {
+        let estimate = client
+            .sample(&opened, u64::MAX - 100 + row as u64, row, &[])
+            .await;
+        assert_eq!(estimate.estimates.is_some(), row + 1 == STEPS, "row {row}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn strange_bytes_and_huge_heads_end_their_connection_only() {
     let desk = Desk::new().await;

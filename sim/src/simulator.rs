@@ -208,7 +208,8 @@ impl Simulator {
 
     /// Simulates many runs on the calling thread; results in the order of the inputs, each bit for
     /// bit what [`Simulator::run`] gives. Where the accurate integrator has minimal coordinates,
-    /// runs of one payload share the vector registers and cost a quarter of what they cost alone.
+    /// runs share the vector registers: they cost a third of what they cost alone if many have one payload,
+    /// and half if each has its own.
     #[must_use]
     pub fn run_batch(
         &self,

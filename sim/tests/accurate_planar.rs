@@ -114,6 +114,35 @@ fn neighbours_and_registers_change_no_bit() {
     }
 }
 
+/// The same for payloads drawn from a range, in which every run has its own modes, and for some runs of one
+/// payload among them.
+#[test]
+fn payloads_side_by_side_change_no_bit() {
+    let simulator = built_in();
+    let body = &simulator.reduced(true).unwrap()[0];
+    let model = PlanarModel::new(simulator.machine().file(), body, true).unwrap();
+    let inputs: Vec<RunInput> = (0..27)
+        .map(|i| {
+            let payload_kg = if i % 5 == 0 { 100.0 } else { 1.0 + 7.3 * i as f64 };
+            random_run(i, payload_kg, 15 + (7 * i as usize) % 20)
+        })
+        .collect();
+    let mut ws = Workspace::default();
+    let alone: Vec<_> = inputs
+        .iter()
+        .map(|input| bits(&model.run(input, SAMPLE_S, TOLERANCE, &mut ws).unwrap()))
+        .collect();
+    for set in InstructionSet::available() {
+        for inputs in [&inputs[..], &inputs[3..]] {
+            let results = model.run_batch_on(set, inputs, SAMPLE_S, TOLERANCE, &mut ws);
+            for (input, result) in inputs.iter().zip(results) {
+                let alone = &alone[usize::try_from(input.run_id).unwrap()];
+                assert_eq!(*alone, bits(&result.unwrap()), "{set:?}, run {}", input.run_id);
+            }
+        }
+    }
+}
+
 /// Minimal and redundant coordinates describe the same machine: with small steps of the general path
 /// every channel of the fast one is within its tolerance. Friction, full gravity moment and cavitation
 /// floor are those of the built-in boom. The general path's trapezoidal rule differs from its limit by

@@ -1,13 +1,14 @@
 """Speed of predictions: our kernel beside onnxruntime in process, our service beside MLServer and
-FastAPI + onnxruntime over HTTP, live sessions, long recordings.
+FastAPI + onnxruntime over HTTP, live sessions, overload, long recordings, restarts.
 
-    cargo build --release -p hydroflex-server --example serving_bench
+    cargo build --release --workspace --example serving_bench --bin hydroflex
     python3 -m venv target/bench-venv
     target/bench-venv/bin/pip install 'mlserver==1.7.1' 'uvloop<0.22' onnxruntime onnx fastapi uvicorn numpy pyarrow
-    target/bench-venv/bin/python tests/bench/serving.py --out docs/benchmark-serving.md
+    target/bench-venv/bin/python tests/bench/serving.py --results target/serving.json --out docs/benchmark-serving.md
 
-Everything that is compared runs in turn, round after round, so that what else the machine does
-meets everybody. Models have random weights: how long a network takes does not depend on them.
+`--only PART` measures one part again and takes the others from `--results`. Everything that is compared
+runs in turn, round after round, so that what else the machine does meets everybody. Models have random
+weights: how long a network takes does not depend on them.
 """
 
 import argparse
@@ -15,6 +16,8 @@ import http.client
 import json
 import os
 import pathlib
+import re
+import signal
 import statistics
 import subprocess
 import sys
@@ -106,6 +109,7 @@ def in_process(bench, rounds):
     """µs of CPU per call: our network, onnxruntime's, our whole prediction, model.onnx with its scales."""
     import onnxruntime
 
+    torch = import_torch()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     # A thread that waits by spinning would slow everything beside it.
@@ -115,6 +119,7 @@ def in_process(bench, rounds):
         folder = bench.folder / structure
         plain = onnxruntime.InferenceSession(plain_onnx(folder), options, providers=["CPUExecutionProvider"])
         whole = onnxruntime.InferenceSession((folder / "model.onnx").read_bytes(), options, providers=["CPUExecutionProvider"])
+        compiled = torch and torch_network(torch, folder)
         for batch in BATCHES:
             calls = max(4, int(40_000 / (5 + 0.8 * batch)))
             x = numpy.random.default_rng(1).standard_normal((batch, STEPS * INPUTS)).astype(numpy.float32)
@@ -130,12 +135,55 @@ def in_process(bench, rounds):
             samples = []
             for round_ in range(rounds + 1):
                 network, prediction = bench.kernel(structure, batch, calls)
-                found = (network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window}))
+                found = [network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window})]
+                if torch:
+                    tensor = torch.from_numpy(x)
+                    begun = time.thread_time()
+                    for _ in range(calls):
+                        compiled(tensor)
+                    found.append((time.thread_time() - begun) / calls * 1e6)
                 if round_:  # the first one warms up
                     samples.append(found)
             rows.append((structure, batch, *(statistics.median(column) for column in zip(*samples))))
             print(rows[-1], flush=True)
     return rows
+
+
+def import_torch():
+    try:
+        import torch
+    except ImportError:
+        return None
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    return torch
+
+
+def torch_network(torch, folder):
+    """The network as a frozen TorchScript module."""
+    config, tensors = json.loads((folder / "config.json").read_text()), safetensors(folder / "model.safetensors")
+    kinds = {"tanh": torch.nn.Tanh, "sigmoid": torch.nn.Sigmoid, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
+
+    def linear(prefix):
+        weight, bias = (torch.from_numpy(tensors[f"{prefix}.{part}"].copy()) for part in ("weight", "bias"))
+        module = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        module.weight.data, module.bias.data = weight, bias
+        return module
+
+    class Network(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            parts = [part for layer in config["layers"]
+                     for part in [linear(layer["name"]), *(kinds[a]() for a in layer["activations"])]]
+            self.body = torch.nn.Sequential(*parts)
+            self.skip = linear("skip") if config["linear_skip"] else None
+
+        def forward(self, x):
+            y = self.body(x)
+            return y if self.skip is None else y + self.skip(x)
+
+    module = Network().eval()
+    return torch.jit.freeze(torch.jit.script(module))
 
 
 # --- over HTTP -----------------------------------------------------------------------------------
@@ -311,12 +359,12 @@ def request_file(bench, server, windows, binary):
     return path
 
 
-def load(bench, server, request, connections, seconds, rate=0):
+def load(bench, server, request, connections, seconds, rate=None):
+    """Every connection as fast as it is answered, or all together `rate` requests per second on a schedule."""
     before = server.stat()[0]
-    out = subprocess.run(
-        [bench.binary, "load", server.address, str(connections), str(seconds), str(rate), request],
-        check=True, capture_output=True, text=True,
-    ).stdout
+    command = ["load", server.address, connections, seconds, request] if rate is None else \
+        ["open-loop", server.address, connections, seconds, rate, request]
+    out = subprocess.run([bench.binary, *map(str, command)], check=True, capture_output=True, text=True).stdout
     found = json.loads(out)
     requests = sum(found["statuses"].values())
     found["cpu_us"] = (server.stat()[0] - before) / max(requests, 1) * 1e6
@@ -349,38 +397,129 @@ def over_http(bench, ours, rounds, seconds):
             server.close()
 
 
-def ours_only(bench, ours, seconds):
-    """p99 at half load, what overload does, memory after many requests, live sessions."""
+def latency(bench, ours, rounds, seconds):
+    """p50 and p99 at half of the saturating load, one window as JSON and as bytes."""
     found = {}
-    one = request_file(bench, ours, 1, False)
-    most = load(bench, ours, one, 16, seconds)["per_second"]
-    found["half"] = load(bench, ours, one, 16, 2 * seconds, most / 2) | {"rate": most / 2}
-    large = request_file(bench, ours, 4096, True)
-    found["large"] = load(bench, ours, large, 2, seconds)
-    found["overload"] = load(bench, ours, large, 64, seconds)
-    before = ours.stat()[1]
-    answered, begun = 0, time.monotonic()
-    while answered < 1_000_000 and time.monotonic() < begun + 90:
-        answered += load(bench, ours, one, 16, 10)["answers"]
-    found["million"] = {"answers": answered, "before_mb": before, "after_mb": ours.stat()[1]}
+    for name, binary in (("JSON", False), ("bytes", True)):
+        one = request_file(bench, ours, 1, binary)
+        most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
+        runs = [load(bench, ours, one, 16, seconds, most / 2) for _ in range(rounds)]
+        found[name] = {key: statistics.median(run[key] for run in runs) for key in ("p50_us", "p99_us", "late_p99_us")}
+        found[name] |= {"rate": most / 2, "best_p99_us": min(run["p99_us"] for run in runs)}
+        print(name, found[name], flush=True)
+    return found
 
-    def sessions(count, rate, length):
-        cpu = ours.stat()[0]
+
+def overload(bench, ours, seconds):
+    """More than can be done: what is refused, and what becomes of the latency of what is accepted."""
+    table = []
+    for windows, binary, few, many in [(1, False, 16, 4000), (64, False, 4, 256), (4096, True, 2, 64)]:
+        request = request_file(bench, ours, windows, binary)
+        for connections in (few, many):
+            found = load(bench, ours, request, connections, seconds)
+            table.append({"windows": windows, "body": "bytes" if binary else "JSON", "connections": connections,
+                          "answered": found["statuses"].get("200", 0), "refused": found["statuses"].get("429", 0),
+                          **{key: found[key] for key in ("per_second", "p50_us", "p99_us")}})
+            assert set(found["statuses"]) <= {"200", "429"}, found
+            print(table[-1], flush=True)
+    return table
+
+
+def memory(bench, ours, count):
+    one = request_file(bench, ours, 1, False)
+    load(bench, ours, one, 16, 2)
+    before, answered, begun = ours.stat()[1], 0, time.monotonic()
+    while answered < count:
+        answered += load(bench, ours, one, 16, 5)["answers"]
+        print(f"{answered} answers, {ours.stat()[1]:.1f} MB", flush=True)
+    return {"answers": answered, "before_mb": before, "after_mb": ours.stat()[1], "seconds": time.monotonic() - begun}
+
+
+def streams(bench, ours, seconds):
+    found = []
+    for count, rate, length in [(1, 1000, seconds), (50, 1000, 2 * seconds), (1000, 10, 4 * seconds)]:
+        cpu, _, _ = ours.stat()
         before = ours.stat()[1]
         process = subprocess.Popen([bench.binary, "stream", ours.address, ours.model, str(count), str(rate), str(length)],
                                    stdout=subprocess.PIPE, text=True)
-        time.sleep(0.3 * length)
+        # Sessions are opened before the first sample.
+        time.sleep(0.5 + count * 1e-3 + 0.2 * length)
         early = ours.stat()[1]
-        time.sleep(0.5 * length)
+        time.sleep(0.6 * length)
         late = ours.stat()[1]
         out = json.loads(process.communicate()[0])
-        out |= {"before_mb": before, "early_mb": early, "late_mb": late}
+        out |= {"sessions": count, "rate": rate, "before_mb": before, "early_mb": early, "late_mb": late}
         out["cpu_us"] = (ours.stat()[0] - cpu) / out["answers"] * 1e6
-        return out
+        found.append(out)
+        print(out, flush=True)
+    return found
 
-    found["one"] = sessions(1, 1000, seconds)
-    found["fifty"] = sessions(50, 1000, 2 * seconds)
-    found["thousand"] = sessions(1000, 10, 4 * seconds)
+
+def felt(bench, rounds):
+    """A manoeuvre of 1 s (200 samples, an estimate for each): simulated, and estimated."""
+    text = (pathlib.Path(__file__).parents[2] / "docs" / "benchmark-simulator.md").read_text()
+
+    def simulated(row):
+        found = re.search(rf"^\| {re.escape(row)} \|(.*)\|$", text, re.MULTILINE)
+        return statistics.median(float(cell) * 1e3 for cell in found[1].split("|"))
+
+    rows = {
+        "Exudyn, as published scripts drive it": simulated("Exudyn, as published scripts drive it (whole run)"),
+        "Exudyn at its best, same step": simulated("Exudyn at its best, 5 ms (whole run)"),
+        "hydroflex `accurate`, alone": simulated("hydroflex `accurate` (tolerance 1e-3), alone"),
+        "hydroflex `accurate`, in a batch": simulated("hydroflex `accurate` (tolerance 1e-3), in a batch, per run and core"),
+    }
+    networks, batches = {}, {}
+    for structure in STRUCTURES:
+        samples = []
+        for _ in range(rounds):
+            out = subprocess.run([bench.binary, "series", bench.folder / structure, str(200 + STEPS - 1), "200"],
+                                 check=True, capture_output=True, text=True).stdout
+            samples.append(json.loads(out)["us"])
+        networks[structure] = statistics.median(samples)
+        batches[structure] = statistics.median(bench.kernel(structure, 4096, 20)[1] / 4096 for _ in range(rounds))
+    print(rows, networks, batches, flush=True)
+    return {"simulated": rows, "networks": networks, "batches": batches}
+
+
+def restart(bench, hydroflex, rounds):
+    """kill -9 in the middle of requests, and again until the same estimates come."""
+    data = bench.folder / "data"
+    out = subprocess.run([bench.binary, "register", bench.folder / "RLR", data], check=True, capture_output=True, text=True).stdout
+    model, port = json.loads(out)["model"], free_port()
+    server = Server("", None, f"127.0.0.1:{port}", model)
+    request = request_file(bench, server, 1, False)
+    body = request.read_bytes().split(b"\r\n\r\n", 1)[1]
+
+    def estimate():
+        connection = http.client.HTTPConnection(server.address, timeout=1)
+        connection.request("POST", f"/v2/models/{model}/infer", body, {"content-type": "application/json"})
+        answer = connection.getresponse()
+        assert answer.status == 200, answer.read()
+        return answer.read()
+
+    times, first = [], None
+    for _ in range(rounds + 1):
+        begun = time.monotonic()
+        process = subprocess.Popen([hydroflex, "serve", "--data", data, "--workers", "0", "--listen", server.address],
+                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while True:
+            assert process.poll() is None, "the service ended"
+            try:
+                answer = estimate()
+                break
+            except OSError:
+                time.sleep(0.005)
+        times.append(time.monotonic() - begun)
+        first = first or answer
+        assert answer == first, "another estimate after the restart"
+        traffic = subprocess.Popen([bench.binary, "load", server.address, "4", "5", request], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        traffic.wait()
+    found = {"first_s": times[0], "median_s": statistics.median(times[1:]), "worst_s": max(times[1:]), "kills": rounds + 1}
+    print(found, flush=True)
     return found
 
 
@@ -401,10 +540,10 @@ def long_recording(bench, rows):
         writer.write_table(table)
         done += count
     writer.close()
-    server = start_ours(bench)
-    try:
-        results = []
-        for limit in (rows // 10, rows):
+    results = []
+    for limit in (rows // 10, rows):
+        server = start_ours(bench)
+        try:
             if limit < rows:
                 part = bench.folder / "part.parquet"
                 pyarrow.parquet.write_table(pyarrow.parquet.ParquetFile(path).read_row_group(0).slice(0, limit), part)
@@ -429,34 +568,38 @@ def long_recording(bench, rows):
             results.append({"rows": metadata.num_rows, "seconds": time.monotonic() - begun, "peak_mb": peak, "cpu_s": cpu,
                             "sent_mb": source.stat().st_size / 1e6, "received_mb": size / 1e6})
             print(results[-1], flush=True)
-        return results
-    finally:
-        server.close()
+        finally:
+            server.close()
+    return results
 
 
-def report(kernel, http_table, ours, recording, arguments):
+def report(results, arguments):
     def us(value):
-        return f"{value:.2f}" if value < 10 else f"{value:.0f}"
+        return f"{value:.2f}" if value < 10 else f"{value:,.0f}"
 
     lines = [
         "# Speed of predictions", "",
-        "Made by `tests/bench/serving.py` (its head says how). Windows of 60 steps of 5 sensors, one target, random weights; "
-        f"medians of {arguments.rounds} rounds in which everything compared runs in turn.", "",
-        f"Machine: {machine()}. It did other work at the same time, so ratios count.", "",
+        "Made by `tests/bench/serving.py` (its head says how; `--only PART` for one part). Windows of 60 steps of 5 sensors, one target, "
+        f"random weights; medians of {arguments.rounds} rounds in which everything compared runs in turn.", "",
+        f"Machine: {machine()}. Other programs ran on it meanwhile (load average {results.get('load', 'unknown')} "
+        "at the end of each part): compare ratios.",
     ]
-    if kernel:
+    if kernel := results.get("kernel"):
+        torch = any(len(row) > 6 for row in kernel)
         lines += [
-            "## In process, one thread, µs of CPU per call", "",
+            "", "## In process, one thread, µs of CPU per call (`--only kernel`)", "",
             "*Network*: f32 in, f32 out, onnxruntime with a plain graph. *Prediction*: samples in engineering units in, estimates out, "
-            "onnxruntime with our `model.onnx`, which holds the scales.", "",
-            "| structure | batch | network: ours | onnxruntime | ratio | prediction: ours | onnxruntime | ratio |",
-            "|---|---|---|---|---|---|---|---|",
+            "onnxruntime with our `model.onnx`, which holds the scales."
+            + ("" if torch else " torch is not installed here, so there is no column for it; the script fills one where it is."), "",
+            "| structure | batch | network: ours | onnxruntime | ratio | prediction: ours | onnxruntime | ratio |" + (" torch | ratio |" if torch else ""),
+            "|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
         ]
-        lines += [f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(p)} | {us(w)} | {w / p:.2f} |"
-                  for s, b, a, o, p, w in kernel]
-    if http_table:
+        for s, b, a, o, p, w, *t in kernel:
+            line = f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(p)} | {us(w)} | {w / p:.2f} |"
+            lines.append(line + "".join(f" {us(v)} | {v / a:.2f} |" for v in t))
+    if http_table := results.get("http"):
         lines += [
-            "", "## Over HTTP, Open Inference Protocol, RLR", "",
+            "", "## Over HTTP, Open Inference Protocol, RLR (`--only http`)", "",
             "16 connections on loopback, each with one request at a time; the client shares the machine's cores with the server. "
             "CPU time is the server's. `bytes`: binary tensors both ways, relative to MLServer's JSON.", "",
             "| server | windows | body | requests/s | CPU µs/request | requests per CPU second, relative | p50 µs | p99 µs |",
@@ -466,24 +609,44 @@ def report(kernel, http_table, ours, recording, arguments):
             reference = next(m for n, w, _, m in http_table if "MLServer" in n and w == windows)
             lines.append(f"| {name} | {windows} | {body} | {median['per_second']:.0f} | {median['cpu_us']:.1f} | "
                          f"{reference['cpu_us'] / median['cpu_us']:.1f} | {us(median['p50_us'])} | {us(median['p99_us'])} |")
-    if ours:
-        half, over, large = ours["half"], ours["overload"], ours["large"]
-        accepted = over["statuses"].get("200", 0)
-        refused = over["statuses"].get("429", 0)
-        lines += [
-            "", "## Our service alone", "",
-            f"- Half of the saturating load ({half['rate']:.0f} requests/s, one window as JSON): p50 {us(half['p50_us'])} µs, p99 {us(half['p99_us'])} µs.",
-            f"- Overload, 4,096 windows per request: 2 connections get {large['per_second']:.0f} answers/s with p99 {large['p99_us'] / 1000:.1f} ms; "
-            f"64 connections get {over['per_second']:.0f} answers/s with p99 {over['p99_us'] / 1000:.1f} ms ({accepted} answered, {refused} refused with 429).",
-            f"- Memory: {ours['million']['before_mb']:.1f} MB before and {ours['million']['after_mb']:.1f} MB after {ours['million']['answers']:,} more requests.",
-        ]
-        for key, text in [("one", "1 session at 1 kHz"), ("fifty", "50 sessions at 1 kHz"), ("thousand", "1,000 sessions at 10 Hz")]:
-            s = ours[key]
-            lines.append(f"- {text}: {s['per_second']:.0f} estimates/s, round trip p50 {us(s['p50_us'])} µs, p99 {us(s['p99_us'])} µs, "
-                         f"{s['cpu_us']:.1f} µs of CPU per sample, memory {s['early_mb']:.1f} MB early and {s['late_mb']:.1f} MB late in the run.")
-    if recording:
-        lines += ["", "## A long recording as Parquet", "", "| rows | seconds | sent MB | received MB | peak memory of the service, MB |", "|---|---|---|---|---|"]
-        lines += [f"| {r['rows']:,} | {r['seconds']:.1f} | {r['sent_mb']:.0f} | {r['received_mb']:.0f} | {r['peak_mb']:.0f} |" for r in recording]
+    if half := results.get("latency"):
+        lines += ["", "## At half of the saturating load (`--only latency`)", "",
+                  "16 connections on a schedule; a latency counts from when its request was due, so it holds what the client was late itself.", "",
+                  "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | of that, client late by (p99) µs |", "|---|---|---|---|---|---|"]
+        lines += [f"| {name} | {f['rate']:.0f} | {us(f['p50_us'])} | {us(f['p99_us'])} | {us(f['best_p99_us'])} | {us(f['late_p99_us'])} |"
+                  for name, f in half.items()]
+    if over := results.get("overload"):
+        lines += ["", "## Overload (`--only overload`)", "",
+                  "Each connection asks again as soon as it is answered, 20 ms after a refusal. Latencies of what was answered, as the client sees them: "
+                  "with thousands of connections its own queue is in them.", "",
+                  "| windows | body | connections | answers/s | answered | refused with 429 | p50 ms | p99 ms |", "|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {o['windows']} | {o['body']} | {o['connections']} | {o['per_second']:.0f} | {o['answered']:,} | {o['refused']:,} | "
+                  f"{o['p50_us'] / 1e3:.1f} | {o['p99_us'] / 1e3:.1f} |" for o in over]
+    if found := results.get("streams"):
+        lines += ["", "## Live sessions (`--only streams`)", "",
+                  "| sessions | samples/s each | estimates/s | round trip p50 µs | p99 µs | CPU µs per sample | memory early, MB | late |",
+                  "|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {s['sessions']:,} | {s['rate']} | {s['per_second']:.0f} | {us(s['p50_us'])} | {us(s['p99_us'])} | {s['cpu_us']:.1f} | "
+                  f"{s['early_mb']:.1f} | {s['late_mb']:.1f} |" for s in found]
+    if recording := results.get("recording"):
+        lines += ["", "## A long recording as Parquet (`--only recording`)", "", "A fresh service for each.", "",
+                  "| rows | seconds | CPU s of the service | sent MB | received MB | peak memory of the service, MB |", "|---|---|---|---|---|---|"]
+        lines += [f"| {r['rows']:,} | {r['seconds']:.1f} | {r['cpu_s']:.1f} | {r['sent_mb']:.0f} | {r['received_mb']:.0f} | {r['peak_mb']:.0f} |" for r in recording]
+    if speed := results.get("felt"):
+        lines += ["", "## A manoeuvre of one second (`--only felt`)", "",
+                  "*Simulated*: ms per run on one core, median over the payloads of [benchmark-simulator.md](benchmark-simulator.md). *Estimated*: the same "
+                  "200 samples, an estimate for each, columns in and columns out; and, as the paper counts, one window of a batch of 4,096 for each run.", "",
+                  "| | ms | " + " | ".join(f"times {s}, {us(speed['networks'][s])} µs" for s in ("RLR", "best")) + " | times one window of RLR in a batch, "
+                  f"{us(speed['batches']['RLR'])} µs |", "|---|---|---|---|---|"]
+        lines += [f"| {name} | {value / 1e3:.3g} | {value / speed['networks']['RLR']:,.0f} | {value / speed['networks']['best']:,.0f} | "
+                  f"{value / speed['batches']['RLR']:.1e} |" for name, value in speed["simulated"].items()]
+    if (mem := results.get("memory")) or results.get("restart"):
+        lines += ["", "## Holding on", ""]
+    if mem:
+        lines.append(f"- {mem['answers']:,} requests (`--only memory`): {mem['before_mb']:.1f} MB before, {mem['after_mb']:.1f} MB after.")
+    if again := results.get("restart"):
+        lines.append(f"- kill -9 under load, {again['kills']} times (`--only restart`): from the start of the process to the first estimate, the same to the last "
+                     f"digit, {again['median_s'] * 1e3:.0f} ms (median), {again['worst_s'] * 1e3:.0f} ms (worst).")
     return "\n".join(lines) + "\n"
 
 
@@ -492,38 +655,54 @@ def machine():
     return f"{os.cpu_count()} × {model}"
 
 
+PARTS = ["kernel", "http", "latency", "overload", "streams", "memory", "recording", "felt", "restart"]
+
+
 def main():
     parser = argparse.ArgumentParser(description=textwrap.dedent(__doc__), formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--binary", default="target/release/examples/serving_bench")
+    parser.add_argument("--hydroflex", default="target/release/hydroflex")
     parser.add_argument("--out", help="file for the report; standard output if absent")
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=3, help="of each load")
     parser.add_argument("--rows", type=int, default=10_000_000, help="of the long recording")
-    parser.add_argument("--only", choices=["kernel", "http", "ours", "recording"], action="append")
+    parser.add_argument("--requests", type=int, default=1_000_000, help="of the memory part")
+    parser.add_argument("--only", choices=PARTS, action="append")
     parser.add_argument("--results", help="file of measured numbers; parts that are not measured now are taken from it")
     arguments = parser.parse_args()
-    parts = arguments.only or ["kernel", "http", "ours", "recording"]
     results = {}
     if arguments.results and os.path.exists(arguments.results):
         results = json.loads(pathlib.Path(arguments.results).read_text())
+    loads = results.setdefault("loads", {})
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(os.path.abspath(arguments.binary), folder)
-        if "kernel" in parts:
-            results["kernel"] = in_process(bench, arguments.rounds)
-        ours = start_ours(bench)
-        try:
-            if "http" in parts:
-                results["http"] = over_http(bench, ours, min(arguments.rounds, 3), arguments.seconds)
-            if "ours" in parts:
-                results["ours"] = ours_only(bench, ours, arguments.seconds)
-        finally:
-            ours.close()
-        if "recording" in parts:
-            results["recording"] = long_recording(bench, arguments.rows)
+
+        def with_ours(measure, *rest):
+            ours = start_ours(bench)
+            try:
+                return measure(bench, ours, *rest)
+            finally:
+                ours.close()
+
+        measures = {
+            "kernel": lambda: in_process(bench, arguments.rounds),
+            "http": lambda: with_ours(over_http, min(arguments.rounds, 3), arguments.seconds),
+            "latency": lambda: with_ours(latency, arguments.rounds, arguments.seconds),
+            "overload": lambda: with_ours(overload, arguments.seconds),
+            "streams": lambda: with_ours(streams, arguments.seconds),
+            "memory": lambda: with_ours(memory, arguments.requests),
+            "recording": lambda: long_recording(bench, arguments.rows),
+            "felt": lambda: felt(bench, arguments.rounds),
+            "restart": lambda: restart(bench, os.path.abspath(arguments.hydroflex), arguments.rounds),
+        }
+        for part in arguments.only or PARTS:
+            results[part] = measures[part]()
+            loads[part] = round(os.getloadavg()[0], 1)
+            if arguments.results:
+                pathlib.Path(arguments.results).write_text(json.dumps(results))
         bench.close()
-    if arguments.results:
-        pathlib.Path(arguments.results).write_text(json.dumps(results))
-    text = report(results.get("kernel"), results.get("http"), results.get("ours"), results.get("recording"), arguments)
+    results["load"] = ", ".join(f"{part} {load}" for part, load in loads.items())
+    text = report(results, arguments)
     if arguments.out:
         pathlib.Path(arguments.out).write_text(text)
     else:

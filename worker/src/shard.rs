@@ -16,8 +16,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Instant;
 
 /// Runs simulated before their records are encoded, per thread: bounds the memory of a shard of
-/// thousands of runs.
-const BATCH_PER_THREAD: usize = 16;
+/// thousands of runs. A batch ends with lanes that wait for the last run, so it is many times the lanes.
+const BATCH_PER_THREAD: usize = 64;
+/// Most runs side by side: a part of a batch is a multiple of it.
+const LANES: usize = 8;
 
 /// A shard ready to be put.
 #[derive(Debug, Clone)]
@@ -109,9 +111,13 @@ pub fn make(
         .collect();
     for batch in runs.chunks(BATCH_PER_THREAD * pool.current_num_threads()) {
         let start = Instant::now();
+        let part = batch
+            .len()
+            .div_ceil(pool.current_num_threads())
+            .next_multiple_of(LANES);
         let records = pool.install(|| {
             batch
-                .par_chunks(BATCH_PER_THREAD)
+                .par_chunks(part)
                 .map(|some| simulate(spec, machine, kind, some, control))
                 .collect::<Result<Vec<Vec<RunRecord>>, ShardFailure>>()
         })?;

@@ -10,6 +10,7 @@
 pub mod record;
 pub mod shard;
 pub mod cut;
+pub mod guard;
 pub mod samples;
 pub mod statistics;
 pub mod window;

@@ -1,5 +1,6 @@
 //! A published data set as readers see it.
 
+use crate::guard::{self, Batches};
 use crate::samples::KEY_COLUMNS;
 use arrow::array::{Array, AsArray, RecordBatch};
 use arrow::datatypes::{Float32Type, Float64Type, UInt64Type};
@@ -8,7 +9,6 @@ use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::dataset::{DATASET_FORMAT, DatasetStatistics, Manifest, SplitName, WindowFacts};
 use hydroflex_openapi::job::{RunFlag, RunStatus};
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder};
 use parquet::errors::ParquetError;
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
@@ -379,7 +379,7 @@ pub struct RunIter {
     files: std::vec::IntoIter<String>,
     channels: Vec<String>,
     only: Option<u64>,
-    reader: Option<(PathBuf, ParquetRecordBatchReader)>,
+    reader: Option<(PathBuf, Batches)>,
     batch: Option<(RecordBatch, usize)>,
     run: Option<RunColumns>,
 }
@@ -488,17 +488,13 @@ fn take_rows(
     Ok(None)
 }
 
-fn open_samples(
-    path: &Path,
-    channels: &[String],
-    only: Option<u64>,
-) -> Result<ParquetRecordBatchReader, OpenError> {
+fn open_samples(path: &Path, channels: &[String], only: Option<u64>) -> Result<Batches, OpenError> {
     let parquet_error = |source| OpenError::Parquet {
         path: path.to_path_buf(),
         source,
     };
     let file = File::open(path).map_err(io_error(path))?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(parquet_error)?;
+    let builder = guard::open_parquet(file).map_err(parquet_error)?;
     let columns = std::iter::once(KEY_COLUMNS[0]).chain(channels.iter().map(String::as_str));
     let mask = ProjectionMask::columns(builder.parquet_schema(), columns);
     let mut builder = builder.with_projection(mask).with_batch_size(16_384);
@@ -517,14 +513,14 @@ fn open_samples(
         let wanted = (0..groups.len()).filter(|&i| holds(&groups[i])).collect();
         builder = builder.with_row_groups(wanted);
     }
-    builder.build().map_err(parquet_error)
+    guard::batches(builder).map_err(parquet_error)
 }
 
 fn read_runs(root: &Path, manifest: &Manifest) -> Result<Vec<RunRow>, OpenError> {
     let path = root.join(crate::runs_table::RUNS_PATH);
     let file = File::open(&path).map_err(io_error(&path))?;
-    let reader = ParquetRecordBatchReaderBuilder::try_new(file)
-        .and_then(ParquetRecordBatchReaderBuilder::build)
+    let reader = guard::open_parquet(file)
+        .and_then(guard::batches)
         .map_err(|source| OpenError::Parquet {
             path: path.clone(),
             source,

@@ -1,7 +1,7 @@
 //! Bounds of the estimates: near a linear map with small coefficients, see
 //! [`hydroflex_openapi::model::Guard`].
 
-use super::kernel::PackedLayer;
+use super::kernel::{PANEL, PackedLayer};
 use crate::model::weights::LinearWeights;
 use hydroflex_openapi::model::{Guard, ScaledChannel};
 
@@ -64,17 +64,45 @@ impl GuardKernel {
         let guides = scratch.chunks(self.guide.padded());
         let estimates = estimates.chunks_mut(self.slack.len());
         for ((guide, row), limited) in guides.zip(estimates).zip(&mut limited[..rows]) {
-            *limited = false;
-            let bounds = guide.iter().zip(&self.slack).zip(&self.range);
-            for (slot, ((guide, slack), [min, max])) in row.iter_mut().zip(bounds) {
-                let within = slot.max(guide - slack).min(guide + slack).max(*min).min(*max);
-                // A NaN becomes a bound, and differs from what it was.
-                #[allow(clippy::float_cmp, reason = "whether the value was touched at all")]
-                {
-                    *limited |= within != *slot;
-                }
-                *slot = within;
-            }
+            *limited = self.clip(row, |target| guide[target]);
         }
+    }
+
+    /// The same for a panel: value i of the window in column c is `x[places[i] + c]`. `scratch` holds
+    /// [`Self::padded`] values for each of [`PANEL`] columns.
+    ///
+    /// # Panics
+    /// When a slice is too short or there are more columns than [`PANEL`].
+    pub fn limit_panel(
+        &self,
+        x: &[f32],
+        places: &[usize],
+        columns: usize,
+        scratch: &mut [f32],
+        estimates: &mut [f32],
+        limited: &mut [bool],
+    ) {
+        self.guide.forward_panel(x, places, columns, scratch);
+        let estimates = estimates.chunks_mut(self.slack.len());
+        for ((column, row), limited) in estimates.enumerate().zip(&mut limited[..columns]) {
+            *limited = self.clip(row, |target| scratch[target * PANEL + column]);
+        }
+    }
+
+    /// Limits one row of estimates; true if one was changed.
+    fn clip(&self, row: &mut [f32], guide: impl Fn(usize) -> f32) -> bool {
+        let mut limited = false;
+        let bounds = self.slack.iter().zip(&self.range);
+        for (target, (slot, (slack, [min, max]))) in row.iter_mut().zip(bounds).enumerate() {
+            let guide = guide(target);
+            let within = slot.max(guide - slack).min(guide + slack).max(*min).min(*max);
+            // A NaN becomes a bound, and differs from what it was.
+            #[allow(clippy::float_cmp, reason = "whether the value was touched at all")]
+            {
+                limited |= within != *slot;
+            }
+            *slot = within;
+        }
+        limited
     }
 }

@@ -1,10 +1,15 @@
 //! Estimates from a trained model, off the tensor framework.
 //!
-//! The kernel is deterministic for a given instruction set and allocates nothing: callers bring a
-//! [`Workspace`]. A window of row-major samples is a slice, and neighbouring windows of a series
-//! overlap in memory, so sliding over a recording copies nothing either.
+//! The kernel allocates nothing: callers bring a [`Workspace`]. An estimate has the same bits on
+//! every processor with AVX2, whatever is estimated beside it and however many windows there are.
+//! Windows of a recording overlap in memory, so sliding over it copies nothing either: a value of
+//! neighbouring windows is a piece of its column.
 
+mod activate;
 pub mod kernel;
+pub mod panel;
+mod scale;
+mod simd;
 pub mod skip;
 pub mod guard;
 pub mod sliding;
@@ -14,26 +19,28 @@ use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
 use guard::GuardKernel;
 use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelConfig};
-use kernel::PackedLayer;
+use kernel::{PANEL, PackedLayer};
+pub use scale::Sample;
+use scale::ScaleMap;
 use skip::SkipKernel;
 
-/// Rows computed at once; activations of a block stay in the second-level cache.
-const BLOCK_ROWS: usize = 48;
+/// Windows from which on a panel is faster than one window after the other.
+const MANY: usize = 8;
 
 /// A model ready to estimate. Shared between threads; each brings its own [`Workspace`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Predictor {
     steps: usize,
     inputs: Scaling,
-    /// Offset and 1 / scale of every value of one sample row.
-    input_maps: Vec<(f64, f64)>,
+    /// Of the values of one window.
+    maps: ScaleMap,
     targets: Scaling,
-    /// Scaled values at which inputs are held; infinite where they are not.
-    limits: Vec<[f64; 2]>,
     /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
     skip: Option<SkipKernel>,
     guard: Option<GuardKernel>,
+    /// Of the values of a panel.
+    places: Vec<usize>,
     intervals: Vec<IntervalTable>,
     envelope: Option<EnvelopeKernel>,
 }
@@ -46,10 +53,20 @@ struct EnvelopeKernel {
     max: Vec<f64>,
 }
 
+/// Scaled windows.
+#[derive(Clone, Copy)]
+enum Windows<'x> {
+    /// One after the other, `stride` values apart.
+    Rows { x: &'x [f32], stride: usize },
+    /// Side by side: value i of window c is `x[places[i] + c]`.
+    Panel { x: &'x [f32], places: &'x [usize] },
+}
+
 /// Scratch memory of one thread.
 #[derive(Debug, Clone)]
 pub struct Workspace {
     window: Vec<f32>,
+    panel: Vec<f32>,
     scaled: Vec<f32>,
     ping: Vec<f32>,
     pong: Vec<f32>,
@@ -83,19 +100,6 @@ pub fn group_squares<'a>(
         let sum: f64 = head.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
         sum / group.components.max(1) as f64
     })
-}
-
-fn scaled_limits(config: &ModelConfig) -> Vec<[f64; 2]> {
-    let limits = |input: usize| {
-        let channel = &config.inputs[input];
-        config
-            .input_limits
-            .get(input)
-            .map_or([f64::NEG_INFINITY, f64::INFINITY], |limits| {
-                limits.map(|value| (value - channel.offset) / channel.scale)
-            })
-    };
-    (0..config.inputs.len()).map(limits).collect()
 }
 
 /// Layers with nothing between them are one linear map: `W₂ (W₁ x + b₁) + b₂ = (W₂ W₁) x + (W₂ b₁ + b₂)`,
@@ -144,10 +148,12 @@ impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let layers = fold(config, weights)
+        let layers: Vec<PackedLayer> = fold(config, weights)
             .iter()
             .map(|(activations, map)| PackedLayer::new(map, activations))
             .collect();
+        let most = layers.iter().map(PackedLayer::inputs).max().unwrap_or(0);
+        let most = most.max(config.window_steps * config.inputs.len());
         let skip = weights.skip.as_ref().map(|map| {
             SkipKernel::new(
                 map,
@@ -174,16 +180,12 @@ impl Predictor {
         Self {
             steps: config.window_steps,
             inputs: Scaling::from_config(&config.inputs),
-            input_maps: config
-                .inputs
-                .iter()
-                .map(|channel| (channel.offset, channel.scale.recip()))
-                .collect(),
+            maps: ScaleMap::new(config),
             targets: Scaling::from_config(&config.targets),
-            limits: scaled_limits(config),
             layers,
             skip,
             guard,
+            places: (0..most).map(|place| place * PANEL).collect(),
             intervals: config.intervals.clone(),
             envelope,
         }
@@ -229,20 +231,18 @@ impl Predictor {
     #[must_use]
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
+        let skip = self.skip.as_ref().map_or(0, SkipKernel::padded);
+        let projected = self.envelope.as_ref().map_or(0, |e| e.projection.padded());
         Workspace {
-            window: vec![0.0; BLOCK_ROWS * self.window_len()],
-            scaled: vec![0.0; BLOCK_ROWS * self.targets.len()],
-            ping: vec![0.0; BLOCK_ROWS * widest],
-            pong: vec![0.0; BLOCK_ROWS * widest],
-            skip: vec![0.0; BLOCK_ROWS * self.skip.as_ref().map_or(0, SkipKernel::padded)],
-            guide: vec![0.0; BLOCK_ROWS * self.guard.as_ref().map_or(0, GuardKernel::padded)],
-            limited: vec![false; BLOCK_ROWS],
-            projected: vec![
-                0.0;
-                self.envelope
-                    .as_ref()
-                    .map_or(0, |e| BLOCK_ROWS * e.projection.padded())
-            ],
+            window: vec![0.0; PANEL * self.window_len()],
+            panel: vec![0.0; PANEL * self.window_len()],
+            scaled: vec![0.0; PANEL * self.targets.len()],
+            ping: vec![0.0; PANEL * widest],
+            pong: vec![0.0; PANEL * widest],
+            skip: vec![0.0; PANEL * skip],
+            guide: vec![0.0; PANEL * self.guard.as_ref().map_or(0, GuardKernel::padded)],
+            limited: vec![false; PANEL],
+            projected: vec![0.0; PANEL * projected],
         }
     }
 
@@ -261,12 +261,7 @@ impl Predictor {
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn predict_windows<T: Copy + Into<f64>>(
-        &self,
-        windows: &[T],
-        out: &mut [f64],
-        workspace: &mut Workspace,
-    ) {
+    pub fn predict_windows<T: Sample>(&self, windows: &[T], out: &mut [f64], workspace: &mut Workspace) {
         self.predict_windows_with(windows, out, None, workspace);
     }
 
@@ -275,7 +270,7 @@ impl Predictor {
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn predict_windows_with<T: Copy + Into<f64>>(
+    pub fn predict_windows_with<T: Sample>(
         &self,
         windows: &[T],
         out: &mut [f64],
@@ -292,11 +287,13 @@ impl Predictor {
             "one flag per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
-        for (block, samples) in windows.chunks(BLOCK_ROWS * size).enumerate() {
+        let mut panel = std::mem::take(&mut workspace.panel);
+        for (block, samples) in windows.chunks(PANEL * size).enumerate() {
             let rows = samples.len() / size;
-            let first = block * BLOCK_ROWS;
-            self.scale_rows(samples, &mut scaled);
-            self.block(&scaled, size, rows, workspace);
+            let first = block * PANEL;
+            self.maps.scale(samples, &mut scaled);
+            let arranged = self.arrange(&scaled, size, rows, &mut panel);
+            self.block(arranged, rows, workspace);
             self.unscale(
                 rows,
                 &mut out[first * targets..(first + rows) * targets],
@@ -304,13 +301,14 @@ impl Predictor {
             );
             if let Some(inside) = inside.as_deref_mut() {
                 let inside = &mut inside[first..first + rows];
-                self.inside_block(&scaled, size, rows, inside, workspace);
+                self.inside_block(arranged, rows, inside, workspace);
                 for (flag, window) in inside.iter_mut().zip(samples.chunks_exact(size)) {
-                    *flag &= self.in_range(window);
+                    *flag &= self.maps.in_range(window);
                 }
             }
         }
         workspace.window = scaled;
+        workspace.panel = panel;
     }
 
     /// Scaled estimates for windows of scaled values that begin `stride` values apart: the network
@@ -328,12 +326,15 @@ impl Predictor {
     ) {
         let targets = self.targets.len();
         assert_eq!(out.len(), rows * targets, "one row of estimates per window");
-        for first in (0..rows).step_by(BLOCK_ROWS) {
-            let block = BLOCK_ROWS.min(rows - first);
-            self.block(&scaled[first * stride..], stride, block, workspace);
+        let mut panel = std::mem::take(&mut workspace.panel);
+        for first in (0..rows).step_by(PANEL) {
+            let block = PANEL.min(rows - first);
+            let arranged = self.arrange(&scaled[first * stride..], stride, block, &mut panel);
+            self.block(arranged, block, workspace);
             out[first * targets..(first + block) * targets]
                 .copy_from_slice(&workspace.scaled[..block * targets]);
         }
+        workspace.panel = panel;
     }
 
     /// Estimates for a recording, the window sliding by one sample: one column of equal length per
@@ -357,36 +358,43 @@ impl Predictor {
         let rows = columns[0].len();
         assert!(columns.iter().all(|c| c.len() == rows), "columns of one length");
         let width = self.inputs.len();
-        let mut scaled = vec![0.0_f32; rows * width];
-        for (channel, (column, (offset, inverse))) in columns.iter().zip(&self.input_maps).enumerate() {
-            let slots = scaled.iter_mut().skip(channel).step_by(width);
-            for (value, slot) in column.iter().zip(slots) {
-                #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-                {
-                    *slot = ((value - offset) * inverse)
-                        .clamp(self.limits[channel][0], self.limits[channel][1])
-                        as f32;
-                }
-            }
-        }
         let count = (rows + 1).saturating_sub(self.steps);
         let targets = self.targets.len();
         let mut estimates = vec![Vec::with_capacity(count); targets];
         let mut inside = vec![true; if self.envelope.is_some() { count } else { 0 }];
-        let mut first = 0;
-        while first < count {
-            let block = BLOCK_ROWS.min(count - first);
-            let x = &scaled[first * width..];
-            self.block(x, width, block, workspace);
+        // Column by column, where a value of neighbouring windows is a slice, with room to read a
+        // whole panel at the end; a few windows row by row.
+        let (between_rows, between_columns) = if count < MANY {
+            (width, 1)
+        } else {
+            (1, rows + PANEL)
+        };
+        let mut scaled = vec![0.0_f32; (rows + PANEL) * width];
+        for (channel, column) in columns.iter().enumerate() {
+            for (row, &value) in column.iter().enumerate() {
+                scaled[channel * between_columns + row * between_rows] = self.maps.scaled(channel, value);
+            }
+        }
+        let places: Vec<usize> = (0..self.window_len())
+            .map(|place| place % width * between_columns + place / width * between_rows)
+            .collect();
+        for first in (0..count).step_by(PANEL) {
+            let block = PANEL.min(count - first);
+            let x = &scaled[first * between_rows..];
+            let windows = if count < MANY {
+                Windows::Rows { x, stride: width }
+            } else {
+                Windows::Panel { x, places: &places }
+            };
+            self.block(windows, block, workspace);
             for row in workspace.scaled[..block * targets].chunks(targets) {
                 for (t, (column, &value)) in estimates.iter_mut().zip(row).enumerate() {
                     column.push(self.targets.unscale(t, f64::from(value)));
                 }
             }
             if !inside.is_empty() {
-                self.inside_block(x, width, block, &mut inside[first..first + block], workspace);
+                self.inside_block(windows, block, &mut inside[first..first + block], workspace);
             }
-            first += block;
         }
         self.outside_range(columns, &mut inside);
         SeriesEstimates {
@@ -405,9 +413,21 @@ impl Predictor {
         table.half_widths.get(class).copied()
     }
 
-    /// Estimates for scaled windows that begin `stride` values apart, one row of scaled targets per
-    /// window in `workspace.scaled`.
-    fn block(&self, x: &[f32], stride: usize, rows: usize, workspace: &mut Workspace) {
+    /// Windows in the form in which so many are estimated fastest, in `panel` if that is another.
+    fn arrange<'x>(&'x self, x: &'x [f32], stride: usize, rows: usize, panel: &'x mut [f32]) -> Windows<'x> {
+        if rows < MANY {
+            return Windows::Rows { x, stride };
+        }
+        panel::transpose(x, stride, rows, self.window_len(), panel);
+        Windows::Panel {
+            x: panel,
+            places: &self.places,
+        }
+    }
+
+    /// Estimates for at most [`PANEL`] windows, one row of scaled targets per window in
+    /// `workspace.scaled`.
+    fn block(&self, windows: Windows<'_>, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
         let Workspace {
             scaled,
@@ -419,26 +439,49 @@ impl Predictor {
             ..
         } = workspace;
         let scaled = &mut scaled[..rows * targets];
-        if let Some((layer, others)) = self.layers.split_first() {
-            layer.forward(x, stride, rows, ping);
-            let (mut from, mut to) = (ping, pong);
-            let mut width = layer.padded();
-            for layer in others {
-                layer.forward(from, width, rows, to);
-                width = layer.padded();
-                std::mem::swap(&mut from, &mut to);
+        let (mut from, mut to) = (ping, pong);
+        scaled.fill(0.0);
+        match windows {
+            Windows::Rows { x, stride } => {
+                if let Some((layer, others)) = self.layers.split_first() {
+                    layer.forward(x, stride, rows, from);
+                    let mut width = layer.padded();
+                    for layer in others {
+                        layer.forward(from, width, rows, to);
+                        width = layer.padded();
+                        std::mem::swap(&mut from, &mut to);
+                    }
+                    for (row, out) in scaled.chunks_mut(targets).enumerate() {
+                        out.copy_from_slice(&from[row * width..][..targets]);
+                    }
+                }
+                if let Some(kernel) = &self.skip {
+                    kernel.add(x, stride, rows, skip, scaled);
+                }
+                if let Some(kernel) = &self.guard {
+                    kernel.limit(x, stride, rows, guide, scaled, limited);
+                }
             }
-            for (row, out) in scaled.chunks_mut(targets).enumerate() {
-                out.copy_from_slice(&from[row * width..][..targets]);
+            Windows::Panel { x, places } => {
+                if let Some((layer, others)) = self.layers.split_first() {
+                    layer.forward_panel(x, places, rows, from);
+                    for layer in others {
+                        layer.forward_panel(from, &self.places, rows, to);
+                        std::mem::swap(&mut from, &mut to);
+                    }
+                    for (row, out) in scaled.chunks_mut(targets).enumerate() {
+                        for (target, slot) in out.iter_mut().enumerate() {
+                            *slot = from[target * PANEL + row];
+                        }
+                    }
+                }
+                if let Some(kernel) = &self.skip {
+                    kernel.add_panel(x, places, rows, skip, scaled);
+                }
+                if let Some(kernel) = &self.guard {
+                    kernel.limit_panel(x, places, rows, guide, scaled, limited);
+                }
             }
-        } else {
-            scaled.fill(0.0);
-        }
-        if let Some(kernel) = &self.skip {
-            kernel.add(x, stride, rows, skip, scaled);
-        }
-        if let Some(kernel) = &self.guard {
-            kernel.limit(x, stride, rows, guide, scaled, limited);
         }
     }
 
@@ -446,45 +489,44 @@ impl Predictor {
     /// envelope, and its estimate not limited. Ranges are not looked at.
     fn inside_block(
         &self,
-        x: &[f32],
-        stride: usize,
+        windows: Windows<'_>,
         rows: usize,
         inside: &mut [bool],
         workspace: &mut Workspace,
     ) {
-        let Some(envelope) = &self.envelope else {
-            inside.fill(true);
-            return;
-        };
-        envelope
-            .projection
-            .forward(x, stride, rows, &mut workspace.projected);
-        let padded = envelope.projection.padded();
-        let rows = workspace.projected[..rows * padded].chunks(padded);
-        for (flag, row) in inside.iter_mut().zip(rows) {
-            *flag = group_squares(&envelope.groups, row)
-                .zip(&envelope.groups)
-                .all(|(square, group)| square <= group.limit);
+        inside.fill(true);
+        if let Some(envelope) = &self.envelope {
+            let projected = &mut workspace.projected;
+            match windows {
+                Windows::Rows { x, stride } => {
+                    envelope.projection.forward(x, stride, rows, projected);
+                    let rows = projected.chunks(envelope.projection.padded());
+                    for (flag, row) in inside.iter_mut().zip(rows) {
+                        *flag = group_squares(&envelope.groups, row)
+                            .zip(&envelope.groups)
+                            .all(|(square, group)| square <= group.limit);
+                    }
+                }
+                Windows::Panel { x, places } => {
+                    envelope.projection.forward_panel(x, places, rows, projected);
+                    let mut coordinates = projected.chunks_exact(PANEL);
+                    for group in &envelope.groups {
+                        let mut sums = [0.0_f64; PANEL];
+                        for values in coordinates.by_ref().take(group.components) {
+                            for (sum, &v) in sums.iter_mut().zip(values) {
+                                *sum += f64::from(v) * f64::from(v);
+                            }
+                        }
+                        for (flag, sum) in inside.iter_mut().zip(sums) {
+                            *flag &= sum / group.components.max(1) as f64 <= group.limit;
+                        }
+                    }
+                }
+            }
         }
         for (flag, limited) in inside.iter_mut().zip(&workspace.limited) {
             *flag &= !limited;
         }
-    }
-
-    /// Whether every value of these sample rows is in the range of its channel.
-    fn in_range<T: Copy + Into<f64>>(&self, rows: &[T]) -> bool {
-        let Some(envelope) = &self.envelope else {
-            return true;
-        };
-        rows.chunks_exact(self.inputs.len()).all(|row| {
-            row.iter()
-                .zip(&envelope.min)
-                .zip(&envelope.max)
-                .all(|((&value, min), max)| {
-                    let value: f64 = value.into();
-                    value >= *min && value <= *max
-                })
-        })
     }
 
     /// Clears `inside` for every window that holds a value outside its channel's range.
@@ -499,18 +541,6 @@ impl Predictor {
                 if row + 1 >= self.steps && row < blocked_until {
                     inside[row + 1 - self.steps] = false;
                 }
-            }
-        }
-    }
-
-    /// Scaled copies of sample rows.
-    #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-    fn scale_rows<T: Copy + Into<f64>>(&self, rows: &[T], out: &mut [f32]) {
-        let width = self.inputs.len();
-        for (row, slots) in rows.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-            let maps = self.input_maps.iter().zip(&self.limits);
-            for ((&value, slot), ((offset, inverse), [low, high])) in row.iter().zip(slots).zip(maps) {
-                *slot = ((value.into() - offset) * inverse).clamp(*low, *high) as f32;
             }
         }
     }

@@ -1,32 +1,42 @@
 //! The skip connection in f64: coefficients that follow slow signals, see [`crate::scheduled`].
 //!
-//! Rows of the map are packed into panels of eight, as [`super::kernel`] does in f32; four partial
-//! sums per panel hide the latency of the multiply-adds. f64 because the coefficients are large
-//! and act on small differences of neighbouring samples; the samples themselves are the scaled f32 values that
-//! the network takes, as in training.
+//! Packed twice and computed in two ways, as [`super::kernel`] does in f32, with the same bits: many
+//! windows side by side, or few windows with outputs side by side. Every sum is made in four parts. f64
+//! because the coefficients are large and act on small differences of neighbouring samples; the
+//! samples themselves are the scaled f32 values that the network takes, as in training. It costs
+//! little: a scheduled map has a twentieth of our own network's products.
 
 #![allow(
+    unsafe_code,
+    unsafe_op_in_unsafe_fn,
     clippy::inline_always,
-    reason = "vector code has to be inlined into the function that enables the instructions"
+    clippy::needless_range_loop,
+    clippy::too_many_arguments,
+    reason = "vector code has to be inlined into the function that enables the instructions, and a bound check per \
+              load would double its cost: lengths are compared before the loops"
 )]
 
-use super::kernel::{Level, level};
+use super::kernel::{Level, PANEL, level};
+use super::simd::{Simd, dispatch};
 use crate::model::weights::SkipWeights;
 use hydroflex_openapi::model::{ScaledChannel, Schedule};
 
-/// Outputs in a panel: one AVX-512 register of f64.
-const LANES: usize = 8;
-/// Partial sums.
+/// Outputs in a group.
+const GROUP: usize = 8;
+/// Outputs in a tile.
+const TILE: usize = 12;
+/// Parts of a sum.
 const PARTS: usize = 4;
-/// Windows at once.
-const ROWS: usize = 3;
 
 /// A packed skip connection.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SkipKernel {
     inputs: usize,
     targets: usize,
-    panels: Vec<[f64; LANES]>,
+    /// `[group][input][8]`.
+    groups: Vec<[f64; GROUP]>,
+    /// `[tile][input][outputs of the tile]`.
+    tiles: Vec<f64>,
     bias: Vec<f64>,
     slow: Vec<SlowSignal>,
     /// Terms × slow signals.
@@ -56,14 +66,20 @@ impl SkipKernel {
         let outputs = map.bias.len();
         let inputs = map.weight.len() / outputs.max(1);
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
-        let mut panels = vec![[0.0; LANES]; outputs.div_ceil(LANES) * inputs];
+        let mut groups = vec![[0.0; GROUP]; outputs.div_ceil(GROUP) * inputs];
+        let mut tiles = vec![0.0; outputs * inputs];
         for (output, row) in map.weight.chunks(inputs.max(1)).enumerate() {
+            let group = &mut groups[output / GROUP * inputs..];
+            let first = output - output % TILE;
+            let width = TILE.min(outputs - first);
+            let tile = &mut tiles[first * inputs..][..width * inputs];
             for (input, &weight) in row.iter().enumerate() {
-                panels[output / LANES * inputs + input][output % LANES] = weight;
+                group[input][output % GROUP] = weight;
+                tile[input * width + output - first] = weight;
             }
         }
         let mut bias = map.bias.clone();
-        bias.resize(outputs.div_ceil(LANES) * LANES, 0.0);
+        bias.resize(outputs.next_multiple_of(GROUP), 0.0);
         let slow = schedule.map_or_else(Vec::new, |schedule| {
             schedule
                 .inputs
@@ -90,25 +106,42 @@ impl SkipKernel {
         Self {
             inputs,
             targets,
-            panels,
+            groups,
+            tiles,
             bias,
             slow,
             exponents,
         }
     }
 
-    /// Values of scratch memory per window.
+    /// Values of scratch memory per window, also of a panel's.
     #[must_use]
     pub fn padded(&self) -> usize {
         self.bias.len()
     }
 
-    /// Adds the map of `rows` scaled windows that begin `stride` values apart to `out`, one row of
-    /// scaled targets per window. `scratch` holds [`Self::padded`] values per window.
+    fn outputs(&self) -> usize {
+        self.exponents.len() * self.targets
+    }
+
+    /// Adds the map of few `rows` scaled windows that begin `stride` values apart to `out`, one row
+    /// of scaled targets per window. `scratch` holds [`Self::padded`] values per window.
     ///
     /// # Panics
     /// When a slice is too short.
     pub fn add(&self, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64], out: &mut [f32]) {
+        self.add_at(level(), x, stride, rows, scratch, out);
+    }
+
+    fn add_at(
+        &self,
+        level: Level,
+        x: &[f32],
+        stride: usize,
+        rows: usize,
+        scratch: &mut [f64],
+        out: &mut [f32],
+    ) {
         if rows == 0 {
             return;
         }
@@ -117,110 +150,216 @@ impl SkipKernel {
             "inputs of {rows} rows"
         );
         assert!(scratch.len() >= rows * self.padded(), "scratch of {rows} rows");
-        match level() {
-            #[cfg(target_arch = "x86_64")]
-            #[allow(unsafe_code, reason = "the features were detected")]
-            // SAFETY: `level` returns `Avx512` only where AVX-512F, AVX2 and FMA were detected.
-            Level::Avx512 => unsafe { self.forward_avx512(x, stride, rows, scratch) },
-            #[cfg(target_arch = "x86_64")]
-            #[allow(unsafe_code, reason = "the features were detected")]
-            // SAFETY: `level` returns `Avx2` only where AVX2 and FMA were detected.
-            Level::Avx2 => unsafe { self.forward_avx2(x, stride, rows, scratch) },
-            Level::Portable => self.forward::<false>(x, stride, rows, scratch),
+        let map = self;
+        {
+            let scratch = &mut *scratch;
+            dispatch!(level, SkipKernel::few(map: &SkipKernel, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64]));
         }
         for row in 0..rows {
             let window = &x[row * stride..];
             let sums = &scratch[row * self.padded()..];
-            for (t, slot) in out[row * self.targets..(row + 1) * self.targets]
-                .iter_mut()
-                .enumerate()
+            self.combine(
+                |position| window[position],
+                |output| sums[output],
+                &mut out[row * self.targets..(row + 1) * self.targets],
+            );
+        }
+    }
+
+    /// The same for a panel: value i of the window in column c is `x[places[i] + c]`. `scratch` holds
+    /// [`Self::padded`] values for each of [`PANEL`] columns.
+    ///
+    /// # Panics
+    /// When a slice is too short or there are more columns than [`PANEL`].
+    pub fn add_panel(
+        &self,
+        x: &[f32],
+        places: &[usize],
+        columns: usize,
+        scratch: &mut [f64],
+        out: &mut [f32],
+    ) {
+        self.add_panel_at(level(), x, places, columns, scratch, out);
+    }
+
+    fn add_panel_at(
+        &self,
+        level: Level,
+        x: &[f32],
+        places: &[usize],
+        columns: usize,
+        scratch: &mut [f64],
+        out: &mut [f32],
+    ) {
+        let computed = columns.next_multiple_of(PANEL / 2);
+        assert!(computed <= PANEL, "a panel has {PANEL} columns");
+        assert!(places.len() >= self.inputs, "a place for each input");
+        let places = &places[..self.inputs];
+        let last = places.iter().max().copied().unwrap_or(0);
+        assert!(x.len() >= last + computed, "inputs of a panel");
+        assert!(scratch.len() >= self.outputs() * PANEL, "scratch of a panel");
+        let map = self;
+        {
+            let scratch = &mut *scratch;
+            dispatch!(level, SkipKernel::many(map: &SkipKernel, x: &[f32], places: &[usize], computed: usize, scratch: &mut [f64]));
+        }
+        for column in 0..columns {
+            self.combine(
+                |position| x[places[position] + column],
+                |output| scratch[output * PANEL + column],
+                &mut out[column * self.targets..(column + 1) * self.targets],
+            );
+        }
+    }
+
+    /// Σₜ mₜ times the sums of term t, added to a window's scaled targets.
+    fn combine(&self, value: impl Fn(usize) -> f32, sum: impl Fn(usize) -> f64, out: &mut [f32]) {
+        for (target, slot) in out.iter_mut().enumerate() {
+            let mut total = f64::from(*slot);
+            for (term, exponents) in self.exponents.iter().enumerate() {
+                let power = |(slow, &exponent): (&SlowSignal, &i32)| {
+                    let u = slow.gain * f64::from(value(slow.position)) + slow.shift;
+                    u.clamp(-1.0, 1.0).powi(exponent)
+                };
+                let factor: f64 = self.slow.iter().zip(exponents).map(power).product();
+                total += factor * sum(term * self.targets + target);
+            }
+            #[allow(clippy::cast_possible_truncation, reason = "scaled estimates are f32")]
             {
-                let mut total = f64::from(*slot);
-                for (term, exponents) in self.exponents.iter().enumerate() {
-                    total += self.factor(window, exponents) * sums[term * self.targets + t];
-                }
-                #[allow(clippy::cast_possible_truncation, reason = "scaled estimates are f32")]
-                {
-                    *slot = total as f32;
-                }
+                *slot = total as f32;
             }
         }
     }
 
-    /// m_t of a window.
-    fn factor(&self, window: &[f32], exponents: &[i32]) -> f64 {
-        let power = |(slow, &exponent): (&SlowSignal, &i32)| {
-            let u = slow.gain * f64::from(window[slow.position]) + slow.shift;
-            u.clamp(-1.0, 1.0).powi(exponent)
-        };
-        self.slow.iter().zip(exponents).map(power).product()
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx512f,avx512vl,avx2,fma")]
-    fn forward_avx512(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
-        self.forward::<true>(x, stride, rows, out);
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn forward_avx2(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
-        self.forward::<true>(x, stride, rows, out);
-    }
-
+    /// Lengths were compared by the caller.
     #[inline(always)]
-    fn forward<const FMA: bool>(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
-        let mut row = 0;
-        while row + ROWS <= rows {
-            self.rows::<ROWS, FMA>(&x[row * stride..], stride, &mut out[row * self.padded()..]);
-            row += ROWS;
-        }
-        while row < rows {
-            self.rows::<1, FMA>(&x[row * stride..], stride, &mut out[row * self.padded()..]);
-            row += 1;
+    unsafe fn many<S: Simd>(map: &Self, x: &[f32], places: &[usize], columns: usize, out: &mut [f64]) {
+        for first in (0..map.outputs()).step_by(TILE) {
+            let width = TILE.min(map.outputs() - first);
+            for column in (0..columns).step_by(S::LANES) {
+                map.tile::<S>(
+                    first,
+                    width,
+                    x.as_ptr().add(column),
+                    places,
+                    out.as_mut_ptr().add(column),
+                );
+            }
         }
     }
 
-    /// R windows. Every sum is made of the same parts in the same order whatever R is.
+    /// Outputs `first..first + width` of two vectors of columns.
     #[inline(always)]
-    fn rows<const R: usize, const FMA: bool>(&self, x: &[f32], stride: usize, out: &mut [f64]) {
-        let windows: [&[f32]; R] = std::array::from_fn(|r| &x[r * stride..r * stride + self.inputs]);
-        for (panel, weights) in self.panels.chunks(self.inputs.max(1)).enumerate() {
-            let mut sums = [[[0.0_f64; LANES]; R]; PARTS];
-            let whole = self.inputs - self.inputs % PARTS;
-            for first in (0..whole).step_by(PARTS) {
-                for part in 0..PARTS {
-                    let w = &weights[first + part];
-                    for r in 0..R {
-                        multiply_add::<FMA>(&mut sums[part][r], f64::from(windows[r][first + part]), w);
+    unsafe fn tile<S: Simd>(
+        &self,
+        first: usize,
+        width: usize,
+        x: *const f32,
+        places: &[usize],
+        out: *mut f64,
+    ) {
+        let weights = self.tiles.as_ptr().add(first * self.inputs);
+        let mut done = 0;
+        while done < width {
+            let (w, at) = (weights.add(done), first + done);
+            let rest = width - done;
+            let taken = if rest >= 12 && S::OUTPUTS_F64 >= 12 {
+                self.block::<S, 12>(w, width, at, x, places, out);
+                12
+            } else if rest >= 6 && S::OUTPUTS_F64 >= 6 {
+                self.block::<S, 6>(w, width, at, x, places, out);
+                6
+            } else if rest >= 3 {
+                self.block::<S, 3>(w, width, at, x, places, out);
+                3
+            } else {
+                self.block::<S, 1>(w, width, at, x, places, out);
+                1
+            };
+            done += taken;
+        }
+    }
+
+    /// R outputs of two vectors of columns, one part after the other.
+    #[inline(always)]
+    unsafe fn block<S: Simd, const R: usize>(
+        &self,
+        weights: *const f64,
+        stride: usize,
+        first: usize,
+        x: *const f32,
+        places: &[usize],
+        out: *mut f64,
+    ) {
+        let half = S::LANES / 2;
+        let mut parts = [[[S::splat_f64(0.0); 2]; R]; PARTS];
+        for part in 0..PARTS {
+            let mut sums = [[S::splat_f64(0.0); 2]; R];
+            let mut input = part;
+            while input < places.len() {
+                let from = x.add(*places.get_unchecked(input));
+                let values = [S::widen(from), S::widen(from.add(half))];
+                let weights = weights.add(input * stride);
+                for r in 0..R {
+                    let weight = S::splat_f64(*weights.add(r));
+                    for p in 0..2 {
+                        sums[r][p] = S::fma_f64(weight, values[p], sums[r][p]);
                     }
                 }
+                input += PARTS;
             }
-            for i in whole..self.inputs {
-                for r in 0..R {
-                    multiply_add::<FMA>(&mut sums[0][r], f64::from(windows[r][i]), &weights[i]);
-                }
-            }
-            for r in 0..R {
-                let first = panel * LANES;
-                let slots = &mut out[r * self.padded() + first..][..LANES];
-                for (lane, slot) in slots.iter_mut().enumerate() {
-                    let total = (sums[0][r][lane] + sums[1][r][lane]) + (sums[2][r][lane] + sums[3][r][lane]);
-                    *slot = total + self.bias[first + lane];
-                }
+            parts[part] = sums;
+        }
+        for r in 0..R {
+            let bias = S::splat_f64(self.bias[first + r]);
+            for p in 0..2 {
+                let [a, b, c, d] = [parts[0][r][p], parts[1][r][p], parts[2][r][p], parts[3][r][p]];
+                let sum = S::add_f64(S::add_f64(a, b), S::add_f64(c, d));
+                S::store_f64(out.add((first + r) * PANEL + p * half), S::add_f64(sum, bias));
             }
         }
     }
-}
 
-#[inline(always)]
-fn multiply_add<const FMA: bool>(sums: &mut [f64; LANES], value: f64, weights: &[f64; LANES]) {
-    for (sum, weight) in sums.iter_mut().zip(weights) {
-        *sum = if FMA {
-            value.mul_add(*weight, *sum)
-        } else {
-            *sum + value * weight
-        };
+    /// Lengths were compared by the caller.
+    #[inline(always)]
+    unsafe fn few<S: Simd>(map: &Self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
+        let half = S::LANES / 2;
+        for row in 0..rows {
+            let x = x.as_ptr().add(row * stride);
+            for first in (0..map.padded()).step_by(half) {
+                let weights = map
+                    .groups
+                    .as_ptr()
+                    .cast::<f64>()
+                    .add(first / GROUP * map.inputs * GROUP + first % GROUP);
+                let mut sums = [S::splat_f64(0.0); PARTS];
+                let whole = map.inputs - map.inputs % PARTS;
+                for input in (0..whole).step_by(PARTS) {
+                    for part in 0..PARTS {
+                        let value = S::splat_f64(f64::from(*x.add(input + part)));
+                        sums[part] = S::fma_f64(
+                            value,
+                            S::load_f64(weights.add((input + part) * GROUP)),
+                            sums[part],
+                        );
+                    }
+                }
+                for part in 0..map.inputs - whole {
+                    let value = S::splat_f64(f64::from(*x.add(whole + part)));
+                    sums[part] = S::fma_f64(
+                        value,
+                        S::load_f64(weights.add((whole + part) * GROUP)),
+                        sums[part],
+                    );
+                }
+                let sum = S::add_f64(S::add_f64(sums[0], sums[1]), S::add_f64(sums[2], sums[3]));
+                let bias = S::load_f64(map.bias.as_ptr().add(first));
+                S::store_f64(
+                    out.as_mut_ptr().add(row * map.padded() + first),
+                    S::add_f64(sum, bias),
+                );
+            }
+        }
     }
 }
 
@@ -285,5 +424,16 @@ mod tests {
             }
         }
         assert!(clamped > 0, "the test should leave the range");
+        // Side by side: value i of window c is x[i + 2 c]; columns of samples make that a panel.
+        let mut panel = vec![0.0; size * PANEL];
+        super::super::panel::transpose(&x, 2, rows, size, &mut panel);
+        let places: Vec<usize> = (0..size).map(|i| i * PANEL).collect();
+        for level in [level(), Level::Portable] {
+            let (mut few, mut many) = (vec![1.0; rows * targets], vec![1.0; rows * targets]);
+            let mut scratch = vec![0.0; PANEL * kernel.padded()];
+            kernel.add_at(level, &x, 2, rows, &mut scratch, &mut few);
+            kernel.add_panel_at(level, &panel, &places, rows, &mut scratch, &mut many);
+            assert_eq!(few, many, "{level:?}");
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! A window that slides one sample at a time, as a live signal comes in.
 
-use super::{Predictor, Workspace};
+use super::{Predictor, Windows, Workspace};
 
 /// The last `window_steps` samples of a signal, scaled, in one piece of memory.
 ///
@@ -86,9 +86,11 @@ impl SlidingWindow {
     fn write(&mut self, predictor: &Predictor, row: usize, sample: &[f64]) {
         let at = row * self.width;
         let twin = at + self.steps * self.width;
-        predictor.scale_rows(sample, &mut self.scaled[at..at + self.width]);
+        predictor
+            .maps
+            .scale(sample, &mut self.scaled[at..at + self.width]);
         self.scaled.copy_within(at..at + self.width, twin);
-        self.in_range[row] = predictor.in_range(sample);
+        self.in_range[row] = predictor.maps.in_range(sample);
     }
 
     /// Estimates for the window in the columns' units, and whether it is inside the envelope.
@@ -102,10 +104,14 @@ impl SlidingWindow {
         }
         let size = self.steps * self.width;
         let window = &self.scaled[self.first * self.width..][..size];
-        predictor.block(window, size, 1, workspace);
+        let windows = Windows::Rows {
+            x: window,
+            stride: size,
+        };
+        predictor.block(windows, 1, workspace);
         predictor.unscale(1, out, workspace);
         let mut inside = [true];
-        predictor.inside_block(window, size, 1, &mut inside, workspace);
+        predictor.inside_block(windows, 1, &mut inside, workspace);
         Some(inside[0] && self.in_range.iter().all(|&in_range| in_range))
     }
 }

@@ -288,10 +288,10 @@ mod tests {
                     Some(k) => {
                         assert_eq!(inside, Some(series.inside[k]));
                         for (t, value) in out.iter().enumerate() {
-                            // f32 sums of size one, in another order where blocks of rows differ.
-                            assert!(
-                                (value - series.columns[t][k]).abs()
-                                    <= 1e-6 * predictor.targets.channels()[t].scale,
+                            // The same bits, however many windows are estimated at once.
+                            assert_eq!(
+                                value.to_bits(),
+                                series.columns[t][k].to_bits(),
                                 "{structure} row {row}"
                             );
                         }
@@ -346,6 +346,31 @@ mod tests {
             .zip(&config.targets)
             .map(|(v, channel)| channel.offset + channel.scale * v)
             .collect()
+    }
+
+    #[test]
+    fn an_estimate_has_the_same_bits_whatever_stands_beside_it() {
+        for structure in ["L", "RLR", "TLTLT", "ELE", "best"] {
+            let predictor = model(structure).predictor();
+            let mut workspace = predictor.workspace();
+            let samples = signal(0, 12 * 45);
+            let mut alone = vec![0.0; 45 * 3];
+            for (window, out) in samples.chunks(60).zip(alone.chunks_mut(3)) {
+                predictor.predict_window(window, out, &mut workspace);
+            }
+            for count in [2, 7, 8, 16, 33, 45] {
+                let mut together = vec![0.0; count * 3];
+                let mut inside = vec![false; count];
+                predictor.predict_windows_with(
+                    &samples[..count * 60],
+                    &mut together,
+                    Some(&mut inside),
+                    &mut workspace,
+                );
+                assert_eq!(together, alone[..count * 3], "{structure}, {count} windows");
+                assert!(inside.iter().all(|inside| *inside));
+            }
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 
 use super::AppState;
 use crate::prediction::LoadedModel;
-use crate::prediction::gate::Busy;
+use crate::prediction::gate::{Busy, Work};
 use crate::prediction::infer::{self, HEADER_LENGTH, Output, WINDOW};
 use crate::prediction::registry::ModelUnusable;
 use axum::Json;
@@ -26,8 +26,10 @@ use std::sync::Arc;
 pub const BODY_LIMIT_BYTES: usize = 64 << 20;
 /// Batches up to here are computed on the spot; larger ones get a thread of their own.
 const INLINE_WINDOWS: usize = 512;
-/// Bodies up to here are read on the spot.
+/// Bodies with bytes up to here are read on the spot.
 const INLINE_BODY_BYTES: usize = 1 << 20;
+/// JSON bodies up to here are read on the spot: a millisecond or two.
+const INLINE_TEXT_BYTES: usize = 256 << 10;
 /// Version of a model that is asked for by its content: it has no other.
 const ONLY_VERSION: &str = "1";
 
@@ -389,8 +391,12 @@ async fn estimate(
     // Windows at most, before the body is read: four bytes a value.
     let window_bytes = 4 * named.model.predictor().window_len().max(1);
     let most = 1 + body.len() / window_bytes;
-    let answer = if body.len() <= INLINE_BODY_BYTES && most <= INLINE_WINDOWS {
-        let _ticket = state.gate().windows(most)?;
+    let (work, most_bytes) = match json_length {
+        Some(_) => (Work::Bytes, INLINE_BODY_BYTES),
+        None => (Work::Text, INLINE_TEXT_BYTES),
+    };
+    let answer = if body.len() <= most_bytes && most <= INLINE_WINDOWS {
+        let _ticket = state.gate().inline(work, body.len()).await?;
         compute(&named, &body, json_length)
     } else {
         let permit = state.gate().thread().await?;

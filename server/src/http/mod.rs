@@ -82,6 +82,13 @@ impl AppState {
         self
     }
 
+    /// The same behind another gate.
+    #[must_use]
+    pub fn behind_gate(mut self, gate: Gate) -> Self {
+        self.gate = Arc::new(gate);
+        self
+    }
+
     /// Who may come in.
     #[must_use]
     pub fn door(&self) -> &auth::Door {

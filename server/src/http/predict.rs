@@ -5,7 +5,7 @@ use super::error::ApiError;
 use super::extract::{BODY_LIMIT_BYTES, Id, parse_json};
 use crate::prediction::LoadedModel;
 use crate::prediction::answer::check_sample_time;
-use crate::prediction::gate::Busy;
+use crate::prediction::gate::{Busy, Work};
 use crate::prediction::session::Session;
 use crate::prediction::spool::{ReceiveError, Spool};
 use crate::prediction::table::{self, TableError, TableForm};
@@ -201,7 +201,7 @@ async fn predict_json(
         }
     })?;
     if bytes.len() <= INLINE_BODY_BYTES && answer_form == Form::Json {
-        let _ticket = state.gate().windows(1 + bytes.len() / 64)?;
+        let _ticket = state.gate().inline(Work::Text, bytes.len()).await?;
         let request: PredictRequest = parse_json(&bytes)?;
         return Ok(Json(model.predict(&request).map_err(ApiError::Invalid)?).into_response());
     }

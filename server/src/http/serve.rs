@@ -24,6 +24,9 @@ const HEADER_TIME: Duration = Duration::from_mins(1);
 const HEAD_LIMIT_BYTES: usize = 64 << 10;
 /// Time for a client to take what was sent.
 const SEND_TIME: Duration = Duration::from_mins(1);
+/// Pause between two times that measurements are counted into their histograms: until then each takes
+/// memory, and nobody may ever ask for them.
+const UPKEEP: Duration = Duration::from_secs(5);
 /// Pause when the system has no more descriptors.
 const EXHAUSTED: Duration = Duration::from_millis(100);
 
@@ -38,6 +41,12 @@ pub async fn serve(listener: TcpListener, router: Router, stop: CancellationToke
         .max_buf_size(HEAD_LIMIT_BYTES);
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     let open = TaskTracker::new();
+    let upkeep = tokio::spawn(async {
+        loop {
+            tokio::time::sleep(UPKEEP).await;
+            super::operations::recorder().run_upkeep();
+        }
+    });
     loop {
         // The semaphore is never closed.
         let Ok(place) = places.clone().acquire_owned().await else {
@@ -78,6 +87,7 @@ pub async fn serve(listener: TcpListener, router: Router, stop: CancellationToke
     }
     open.close();
     open.wait().await;
+    upkeep.abort();
     Ok(())
 }
 

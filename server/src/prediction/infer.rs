@@ -15,6 +15,8 @@ pub const HEADER_LENGTH: &str = "inference-header-content-length";
 /// Name of the tensor in.
 pub const WINDOW: &str = "window";
 
+/// Values that room is made for before any is read.
+const USUAL_VALUES: usize = 512;
 /// Dimensions that `data` may be nested in: batch, steps, inputs.
 const DEEPEST: usize = 3;
 
@@ -145,7 +147,8 @@ struct Flat(Vec<f64>);
 
 impl<'de> Deserialize<'de> for Flat {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let mut values = Vec::new();
+        // As many as a usual window has: growing from nothing would move them ten times.
+        let mut values = Vec::with_capacity(USUAL_VALUES);
         let list = List {
             values: &mut values,
             depth: 1,

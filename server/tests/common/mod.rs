@@ -4,7 +4,10 @@
 )]
 //! The whole router around a ledger and a store in a temporary directory; no workers, no sockets.
 
+pub(crate) mod damage;
 pub(crate) mod models;
+
+pub(crate) use damage::damaged;
 
 use axum::Router;
 use axum::body::Body;
@@ -20,6 +23,7 @@ use tower::ServiceExt;
 pub(crate) struct Desk {
     pub(crate) ledger: Ledger,
     pub(crate) blobs: Blobs,
+    pub(crate) state: AppState,
     router: Router,
     _folder: tempfile::TempDir,
 }
@@ -37,6 +41,11 @@ impl Desk {
 
     /// A desk that looks after at most so many jobs, or asks for keys.
     pub(crate) async fn with(most_jobs: u64, keys: bool) -> Self {
+        Self::changed(most_jobs, |state| if keys { state.behind_keys() } else { state }).await
+    }
+
+    /// A desk whose state is changed before it opens.
+    pub(crate) async fn changed(most_jobs: u64, change: impl FnOnce(AppState) -> AppState) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let url = format!("sqlite:{}", folder.path().join("ledger.sqlite").display());
         let ledger = Ledger::create(&url).await.unwrap();
@@ -50,14 +59,12 @@ impl Desk {
             most_jobs,
         };
         let coordinator = Coordinator::new(ledger.clone(), blobs.clone(), config);
-        let mut state = AppState::new(coordinator);
-        if keys {
-            state = state.behind_keys();
-        }
-        let router = hydroflex_server::app(state);
+        let state = change(AppState::new(coordinator));
+        let router = hydroflex_server::app(state.clone());
         Self {
             ledger,
             blobs,
+            state,
             router,
             _folder: folder,
         }

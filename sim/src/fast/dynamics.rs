@@ -2,7 +2,7 @@
 
 use super::constants::{Constants, Cylinder, ModeSet};
 use super::elementary::{exp, sin_cos, tanh};
-use super::lane::Lane;
+use super::lane::{Coefficient, Lane};
 use super::sums::sums;
 use hydroflex_openapi::machine::{EndStopSpec, FrictionSpec};
 
@@ -97,7 +97,7 @@ pub(super) struct Rates<L, const A: usize, const B: usize, const Q: usize> {
     pub(super) force: L,
     /// ∂length/∂θ.
     pub(super) jt: L,
-    /// Θ(z).
+    /// Θ(z); filled with the slopes.
     pub(super) inertia: L,
     /// h(z) of coupled modes.
     pub(super) h: [L; A],
@@ -214,8 +214,15 @@ impl<L: Lane> Heading<L> {
 /// Evaluates the right-hand side at `y` with the valve opened by `opening`; `heading` is that of the
 /// step. `SLOPES` fills [`Rates::slopes`] too.
 #[inline(always)]
-pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+pub(super) fn evaluate<
+    const SLOPES: bool,
+    L: Lane,
+    K: Coefficient<L>,
+    const A: usize,
+    const B: usize,
+    const Q: usize,
+>(
+    c: &Constants<K, A, B, Q>,
     y: &Point<L, A, B, Q>,
     heading: &Heading<L>,
     opening: L,
@@ -223,6 +230,7 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
     r: &mut Rates<L, A, B, Q>,
 ) {
     let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     let heading = heading.turned(y.theta);
     r.base = heading.body(c.base_m);
     r.gravity = heading.body(c.gravity_m_per_s2);
@@ -231,7 +239,7 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
     // Geometry of the cylinder
     let (z, v, set) = (&y.z.coupled, &y.v.coupled, &c.coupled);
     let coupled = sums!(L::trip(A, set.used), |i| {
-        let [x, y, axial] = [k(set.rod[0][i]), k(set.rod[1][i]), k(set.rod[2][i])];
+        let [x, y, axial] = [q(set.rod[0][i]), q(set.rod[1][i]), q(set.rod[2][i])];
         [
             z[i] * x,
             z[i] * y,
@@ -239,15 +247,15 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
             v[i] * x,
             v[i] * y,
             v[i] * axial,
-            z[i] * k(set.moment[0][i]),
-            z[i] * k(set.moment[1][i]),
-            z[i] * k(c.hub_change[i]),
-            v[i] * k(c.c[i]),
+            z[i] * q(set.moment[0][i]),
+            z[i] * q(set.moment[1][i]),
+            z[i] * q(c.hub_change[i]),
+            v[i] * q(c.c[i]),
         ]
     });
     let (z, v, set) = (&y.z.plain, &y.v.plain, &c.plain);
     let plain = sums!(L::trip(B, set.used), |i| {
-        let [x, y, axial] = [k(set.rod[0][i]), k(set.rod[1][i]), k(set.rod[2][i])];
+        let [x, y, axial] = [q(set.rod[0][i]), q(set.rod[1][i]), q(set.rod[2][i])];
         [
             z[i] * x,
             z[i] * y,
@@ -255,8 +263,8 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
             v[i] * x,
             v[i] * y,
             v[i] * axial,
-            z[i] * k(set.moment[0][i]),
-            z[i] * k(set.moment[1][i]),
+            z[i] * q(set.moment[0][i]),
+            z[i] * q(set.moment[1][i]),
         ]
     });
     let rod = [
@@ -274,13 +282,13 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
         n[0] * (coupled[3] + plain[3]) + n[1] * (coupled[4] + plain[4]) + n[2] * (coupled[5] + plain[5]);
     r.speed = r.jt * y.omega + stretch;
     r.moment = [
-        (coupled[6] + plain[6]) + k(c.moment_kg_m[0]),
-        (coupled[7] + plain[7]) + k(c.moment_kg_m[1]),
+        (coupled[6] + plain[6]) + q(c.moment_kg_m[0]),
+        (coupled[7] + plain[7]) + q(c.moment_kg_m[1]),
     ];
     let (gz, cv) = (coupled[8], coupled[9]);
 
     hydraulics::<SLOPES, _, A, B, Q>(&c.cylinder, y, opening, regime, r);
-    r.lag = (r.force - y.lag) * k(c.lag_per_s);
+    r.lag = (r.force - y.lag) * q(c.lag_per_s);
 
     // Modal forces without the couplings of the rotation
     let push = [r.force * n[0], r.force * n[1], r.force * n[2]];
@@ -303,18 +311,18 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
         &mut r.a.follower,
     );
     let (curvature, bzv) = products(c, y, omega2, r);
-    let hub = k(c.hub_kg_m2) + (gz + gz) + curvature;
+    let hub = q(c.hub_kg_m2) + (gz + gz) + curvature;
     let coriolis = (y.omega + y.omega) * (cv + bzv);
     let torque = r.moment[0] * gy - r.moment[1] * gx - r.force * r.jt - coriolis;
 
     // Θ α + h·a = torque, h α + a = q
-    let [hq, hh] = sums!(L::trip(A, c.coupled.used), |i| {
-        [r.h[i] * r.a.coupled[i], r.h[i] * r.h[i]]
-    });
-    let [plain_hq, plain_hh] = sums!(L::trip(B, c.plain.used), |i| {
-        [r.h_plain[i] * r.a.plain[i], r.h_plain[i] * r.h_plain[i]]
-    });
-    r.inertia = hub + (hh + plain_hh);
+    let [hq] = sums!(L::trip(A, c.coupled.used), |i| [r.h[i] * r.a.coupled[i]]);
+    let [plain_hq] = sums!(L::trip(B, c.plain.used), |i| [r.h_plain[i] * r.a.plain[i]]);
+    if SLOPES {
+        let [hh] = sums!(L::trip(A, c.coupled.used), |i| [r.h[i] * r.h[i]]);
+        let [plain_hh] = sums!(L::trip(B, c.plain.used), |i| [r.h_plain[i] * r.h_plain[i]]);
+        r.inertia = hub + (hh + plain_hh);
+    }
     r.alpha = (torque - (hq + plain_hq)) / hub;
     for i in 0..L::trip(A, c.coupled.used) {
         r.a.coupled[i] -= r.h[i] * r.alpha;
@@ -329,27 +337,27 @@ pub(super) fn evaluate<const SLOPES: bool, L: Lane, const A: usize, const B: usi
 
 /// Weight, cylinder force along `push`, elastic and damping forces of modes.
 #[inline(always)]
-fn loads<L: Lane, const N: usize>(
-    set: &ModeSet<N>,
+fn loads<L: Lane, K: Coefficient<L>, const N: usize>(
+    set: &ModeSet<K, N>,
     gravity: [L; 2],
     push: [L; 3],
     z: &[L; N],
     v: &[L; N],
     a: &mut [L; N],
 ) {
-    let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     for i in 0..L::trip(N, set.used) {
         let weight =
-            gravity[0] * k(set.weight[0][i]) + gravity[1] * k(set.weight[1][i]) + k(set.weight_axial[i]);
-        let force = push[0] * k(set.rod[0][i]) + push[1] * k(set.rod[1][i]) + push[2] * k(set.rod[2][i]);
-        a[i] = (weight - force) - (z[i] * k(set.w2[i]) + v[i] * k(set.d[i]));
+            gravity[0] * q(set.weight[0][i]) + gravity[1] * q(set.weight[1][i]) + q(set.weight_axial[i]);
+        let force = push[0] * q(set.rod[0][i]) + push[1] * q(set.rod[1][i]) + push[2] * q(set.rod[2][i]);
+        a[i] = (weight - force) - (z[i] * q(set.w2[i]) + v[i] * q(set.d[i]));
     }
 }
 
 /// C z and C v for modes of another kind, z and v those of the coupled ones.
 #[inline(always)]
-fn rows<L: Lane, const A: usize, const N: usize>(
-    matrix: &[[f64; N]; A],
+fn rows<L: Lane, K: Coefficient<L>, const A: usize, const N: usize>(
+    matrix: &[[K; N]; A],
     columns: usize,
     count: usize,
     z: &[L; A],
@@ -359,8 +367,8 @@ fn rows<L: Lane, const A: usize, const N: usize>(
     let mut cv = [L::splat(0.0); N];
     for j in 0..columns {
         for i in 0..count {
-            cz[i] += z[j] * L::splat(matrix[j][i]);
-            cv[i] += v[j] * L::splat(matrix[j][i]);
+            cz[i] += z[j] * matrix[j][i].pack();
+            cv[i] += v[j] * matrix[j][i].pack();
         }
     }
     (cz, cv)
@@ -368,8 +376,8 @@ fn rows<L: Lane, const A: usize, const N: usize>(
 
 /// Inertia products with the coupled modes: sets h, adds to the modal forces, returns zᵀGz and vᵀBz.
 #[inline(always)]
-fn products<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn products<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     y: &Point<L, A, B, Q>,
     omega2: L,
     r: &mut Rates<L, A, B, Q>,
@@ -383,26 +391,26 @@ fn products<L: Lane, const A: usize, const B: usize, const Q: usize>(
     let mut gz = [zero; A];
     for j in 0..count {
         for i in 0..count {
-            bz[i] += z[j] * L::splat(c.b[j][i]);
-            cz[i] += z[j] * L::splat(c.cc[j][i]);
-            cv[i] += v[j] * L::splat(c.cc[j][i]);
-            gz[i] += z[j] * L::splat(c.hub_curvature[j][i]);
+            bz[i] += z[j] * c.b[j][i].pack();
+            cz[i] += z[j] * c.cc[j][i].pack();
+            cv[i] += v[j] * c.cc[j][i].pack();
+            gz[i] += z[j] * c.hub_curvature[j][i].pack();
         }
     }
     let twice = y.omega + y.omega;
     for i in 0..count {
-        r.h[i] = L::splat(c.coupled.h0[i]) - cz[i];
-        r.a.coupled[i] += twice * cv[i] + omega2 * (L::splat(c.c[i]) + bz[i]);
+        r.h[i] = c.coupled.h0[i].pack() - cz[i];
+        r.a.coupled[i] += twice * cv[i] + omega2 * (c.c[i].pack() + bz[i]);
     }
     let (cz, cv) = rows(&c.plain_cc, count, L::trip(B, c.plain.used), z, v);
     for i in 0..L::trip(B, c.plain.used) {
-        r.h_plain[i] = L::splat(c.plain.h0[i]) - cz[i];
-        r.a.plain[i] += twice * cv[i] + omega2 * L::splat(c.plain_c[i]);
+        r.h_plain[i] = c.plain.h0[i].pack() - cz[i];
+        r.a.plain[i] += twice * cv[i] + omega2 * c.plain_c[i].pack();
     }
     let (cz, cv) = rows(&c.follower_cc, count, L::trip(Q, c.follower.used), z, v);
     for i in 0..L::trip(Q, c.follower.used) {
-        r.h_follower[i] = L::splat(c.follower.h0[i]) - cz[i];
-        r.a.follower[i] += twice * cv[i] + omega2 * L::splat(c.follower_c[i]);
+        r.h_follower[i] = c.follower.h0[i].pack() - cz[i];
+        r.a.follower[i] += twice * cv[i] + omega2 * c.follower_c[i].pack();
     }
     let [curvature, bzv] = sums!(count, |i| [z[i] * gz[i], v[i] * bz[i]]);
     (curvature, bzv)

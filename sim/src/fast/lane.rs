@@ -45,6 +45,19 @@ pub(super) trait Lane:
     fn trip(padded: usize, used: usize) -> usize;
 }
 
+/// A constant of the step loop: a number for all lanes, or a pack with one for each.
+pub(super) trait Coefficient<L>: Copy {
+    /// In every lane what is meant for it.
+    fn pack(self) -> L;
+}
+
+impl<L: Lane> Coefficient<L> for f64 {
+    #[inline(always)]
+    fn pack(self) -> L {
+        L::splat(self)
+    }
+}
+
 impl Lane for f64 {
     const WIDTH: usize = 1;
 

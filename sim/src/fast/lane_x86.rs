@@ -7,7 +7,7 @@
     reason = "vendor intrinsics; reached only after the instruction set was detected"
 )]
 
-use super::lane::Lane;
+use super::lane::{Coefficient, Lane};
 use core::arch::x86_64::{
     __m256d, __m512d, _CMP_LT_OQ, _mm256_add_epi64, _mm256_add_pd, _mm256_and_pd, _mm256_andnot_pd,
     _mm256_blendv_pd, _mm256_castpd_si256, _mm256_castsi256_pd, _mm256_cmp_pd, _mm256_div_pd, _mm256_max_pd,
@@ -76,6 +76,20 @@ macro_rules! operators {
             }
         }
     };
+}
+
+impl Coefficient<Self> for Pack4 {
+    #[inline(always)]
+    fn pack(self) -> Self {
+        self
+    }
+}
+
+impl Coefficient<Self> for Pack8 {
+    #[inline(always)]
+    fn pack(self) -> Self {
+        self
+    }
 }
 
 operators!(Pack4, _mm256_add_pd, _mm256_sub_pd, _mm256_mul_pd, _mm256_div_pd);

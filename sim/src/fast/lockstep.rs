@@ -2,15 +2,17 @@
 //!
 //! Lanes share the instructions and nothing else: a run's numbers do not depend on its neighbours.
 
-use super::constants::Constants;
+use super::constants::{Constants, Cylinder};
 use super::dynamics::{Point, Rates, Regime};
-use super::lane::Lane;
+use super::lane::{Coefficient, Lane};
+use super::model::PlanarModel;
 use super::record::machine_channels;
 use super::statics::rest;
 use super::step::{StepBuffer, step};
 use super::sums::sums;
 use super::tableau::{RODAS5P, Tableau};
 use super::track::{Outcome, Track, Verdict};
+use crate::simulator::SimulatorError;
 use crate::trajectory::{RunFailure, RunInput, Trajectory};
 
 /// Result of one run of a batch.
@@ -37,7 +39,7 @@ impl Common {
     /// and the stiff modes lower the order, so the local tolerance falls with its square; the factor
     /// is measured on the published boom (`sim/theory/minimal_coordinates.md`, §6).
     pub(super) fn new(sample_time_s: f64, tolerance: f64) -> Self {
-        let local = (250.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
+        let local = (400.0 * tolerance * tolerance).clamp(LEAST_LOCAL, 1e-2);
         Self {
             sample_time_s,
             tolerance,
@@ -47,10 +49,104 @@ impl Common {
     }
 }
 
+/// Where the constants of a run come from.
+pub(super) trait Bodies<L, const A: usize, const B: usize, const Q: usize> {
+    /// What a constant is.
+    type Constant: Coefficient<L>;
+
+    /// The cylinder, which all runs have in common.
+    fn cylinder(&self) -> &Cylinder;
+
+    /// Makes the lane ready for a run and gives its constants; `None` if they do not fit the sizes of
+    /// this loop, and the run is left without a result.
+    fn enter(
+        &mut self,
+        lane: usize,
+        input: &RunInput,
+    ) -> Result<Option<&Constants<f64, A, B, Q>>, RunFailure>;
+
+    /// Those of all lanes; `None` before the first run.
+    fn constants(&self) -> Option<&Constants<Self::Constant, A, B, Q>>;
+}
+
+/// All runs have the same payload.
+impl<L: Lane, const A: usize, const B: usize, const Q: usize> Bodies<L, A, B, Q>
+    for &Constants<f64, A, B, Q>
+{
+    type Constant = f64;
+
+    fn cylinder(&self) -> &Cylinder {
+        &self.cylinder
+    }
+
+    fn enter(&mut self, _: usize, _: &RunInput) -> Result<Option<&Constants<f64, A, B, Q>>, RunFailure> {
+        Ok(Some(self))
+    }
+
+    fn constants(&self) -> Option<&Constants<f64, A, B, Q>> {
+        Some(self)
+    }
+}
+
+/// Every run has its own payload, and every lane its own constants.
+pub(super) struct OwnBodies<'a, L, const A: usize, const B: usize, const Q: usize> {
+    model: &'a PlanarModel,
+    tolerance: f64,
+    packed: Option<Box<Constants<L, A, B, Q>>>,
+    last: Option<Box<Constants<f64, A, B, Q>>>,
+}
+
+impl<'a, L, const A: usize, const B: usize, const Q: usize> OwnBodies<'a, L, A, B, Q> {
+    /// For runs of a model.
+    pub(super) fn new(model: &'a PlanarModel, tolerance: f64) -> Self {
+        Self {
+            model,
+            tolerance,
+            packed: None,
+            last: None,
+        }
+    }
+}
+
+impl<L: Lane + Coefficient<L>, const A: usize, const B: usize, const Q: usize> Bodies<L, A, B, Q>
+    for OwnBodies<'_, L, A, B, Q>
+{
+    type Constant = L;
+
+    fn cylinder(&self) -> &Cylinder {
+        self.model.cylinder()
+    }
+
+    fn enter(
+        &mut self,
+        lane: usize,
+        input: &RunInput,
+    ) -> Result<Option<&Constants<f64, A, B, Q>>, RunFailure> {
+        let modes = self
+            .model
+            .modes(input.payload_kg)
+            .map_err(|reason| RunFailure::Machine(SimulatorError::Planar(reason)))?;
+        let order = self.model.order(&modes, self.tolerance);
+        let Some(own) = self.model.constants(&modes, &order) else {
+            return Ok(None);
+        };
+        match &mut self.packed {
+            // A lane without a run has the first one's body, so that it stays finite.
+            None => self.packed = Some(Box::new(Constants::splat(&own))),
+            Some(packed) => packed.set_lane(lane, &own),
+        }
+        Ok(Some(self.last.insert(Box::new(own))))
+    }
+
+    fn constants(&self) -> Option<&Constants<L, A, B, Q>> {
+        self.packed.as_deref()
+    }
+}
+
 /// Simulates `inputs` in the order of `jobs` and puts each result into its place of `results`.
 #[inline(always)]
 pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+    bodies: &mut impl Bodies<L, A, B, Q>,
     common: &Common,
     inputs: &[RunInput],
     jobs: &[usize],
@@ -58,8 +154,7 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
     results: &mut [Option<RunResult>],
 ) {
     let zero = L::splat(0.0);
-    let cylinder = &c.cylinder;
-    let channels = super::record::MACHINE_CHANNELS + c.readouts.len();
+    let cylinder = &bodies.cylinder().clone();
     let mut queue = jobs.iter();
     let mut tracks: Vec<Option<Track<'_>>> = (0..L::WIDTH).map(|_| None).collect();
     let mut state = Point::<L, A, B, Q>::zero();
@@ -70,7 +165,7 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
         line_pa: [L::splat(cylinder.supply_pa), L::splat(cylinder.tank_pa)],
         filled: [L::splat(1.0); 2],
     };
-    let mut readings = vec![zero; c.sensors.len()];
+    let mut readings = Vec::new();
     // A lane without a run keeps computing; start it where a run starts, so that it stays finite.
     let mut idle_ready = false;
     loop {
@@ -79,8 +174,18 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
         for (lane, place) in tracks.iter_mut().enumerate() {
             while place.is_none() {
                 let Some(&job) = queue.next() else { break };
-                match rest(c, inputs[job].angles_rad[0]) {
+                let body = match bodies.enter(lane, &inputs[job]) {
+                    Ok(Some(body)) => body,
+                    Ok(None) => continue,
+                    Err(failure) => {
+                        results[job] = Some(Err(failure));
+                        continue;
+                    }
+                };
+                match rest(body, inputs[job].angles_rad[0]) {
                     Ok(start) => {
+                        let channels = super::record::MACHINE_CHANNELS + body.readouts.len();
+                        readings.resize(body.sensors.len(), zero);
                         if !idle_ready {
                             idle_ready = true;
                             for other in 0..L::WIDTH {
@@ -122,6 +227,8 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
         if !busy {
             return;
         }
+        let Some(c) = bodies.constants() else { return };
+        let c = std::hint::black_box(c);
         step(c, common.method, &state, step_s, &regime, buffer);
         if recording {
             read(c, &state, &buffer.start, &mut readings);
@@ -151,38 +258,38 @@ pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
 
 /// What the sensors' rows read.
 #[inline(always)]
-fn read<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn read<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     state: &Point<L, A, B, Q>,
     start: &Rates<L, A, B, Q>,
     readings: &mut [L],
 ) {
-    let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     let z = &state.z;
     let [fx, fy, fz] = start.n.map(|n| n * state.lag);
     for (reading, row) in readings.iter_mut().zip(&c.sensors) {
-        let [coupled] = sums!(L::trip(A, c.coupled.used), |i| [z.coupled[i] * k(row.coupled[i])]);
-        let [plain] = sums!(L::trip(B, c.plain.used), |i| [z.plain[i] * k(row.plain[i])]);
+        let [coupled] = sums!(L::trip(A, c.coupled.used), |i| [z.coupled[i] * q(row.coupled[i])]);
+        let [plain] = sums!(L::trip(B, c.plain.used), |i| [z.plain[i] * q(row.plain[i])]);
         let [follower] = sums!(L::trip(Q, c.follower.used), |i| {
-            [z.follower[i] * k(row.follower[i])]
+            [z.follower[i] * q(row.follower[i])]
         });
         let part = &row.lagging;
-        let weight = start.gravity[0] * k(part[0]) + start.gravity[1] * k(part[1]) + k(part[2]);
-        let force = fx * k(part[3]) + fy * k(part[4]) + fz * k(part[5]);
+        let weight = start.gravity[0] * q(part[0]) + start.gravity[1] * q(part[1]) + q(part[2]);
+        let force = fx * q(part[3]) + fy * q(part[4]) + fz * q(part[5]);
         *reading = (coupled + plain) + (follower + (weight + force));
     }
 }
 
 /// Records and judges one lane; `None` when the run is finished.
 #[inline(always)]
-fn advance<L: Lane, const A: usize, const B: usize, const Q: usize>(
+fn advance<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
     track: &mut Track<'_>,
     state: &Point<L, A, B, Q>,
     buffer: &StepBuffer<L, A, B, Q>,
     readings: &[L],
     error2: f64,
     lane: usize,
-    c: &Constants<A, B, Q>,
+    c: &Constants<K, A, B, Q>,
 ) -> Result<Option<Verdict>, RunFailure> {
     if track.record_due {
         let machine = machine_channels(track.valve_at_sample(), track.alpha, state, &buffer.start, lane);
@@ -204,6 +311,8 @@ fn advance<L: Lane, const A: usize, const B: usize, const Q: usize>(
         ],
         rate: both(|r| &r.p_raw),
         alpha: buffer.alpha.get(lane),
+        speed_m_per_s: buffer.end.speed.get(lane),
+        speed_range_m_per_s: [buffer.speed_range[0].get(lane), buffer.speed_range[1].get(lane)],
         length_m: buffer.end.length.get(lane),
         finite: (next.p[0].get(lane) + next.p[1].get(lane) + next.omega.get(lane)).is_finite(),
     };
@@ -237,8 +346,8 @@ fn load<L: Lane, const A: usize, const B: usize, const Q: usize>(
 
 /// Moves the lanes that are accepted (1, the others 0) to the new state.
 #[inline(always)]
-fn take<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn take<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     state: &mut Point<L, A, B, Q>,
     from: &Point<L, A, B, Q>,
     accepted: L,

@@ -104,7 +104,7 @@ impl PlanarModel {
     ) -> Vec<Result<Trajectory, RunFailure>> {
         let common = Common::new(sample_time_s, tolerance);
         let mut results: Vec<_> = inputs.iter().map(|_| None).collect();
-        // Lanes share the modes, so a group has one payload.
+        // Runs of one payload share the modes; what is too few for that has modes of its own, lane by lane.
         let mut order: Vec<usize> = (0..inputs.len()).collect();
         order.sort_by(|&i, &j| {
             inputs[i]
@@ -112,8 +112,20 @@ impl PlanarModel {
                 .total_cmp(&inputs[j].payload_kg)
                 .then(i.cmp(&j))
         });
+        let (mut few, mut payloads) = (Vec::new(), 0);
         for jobs in order.chunk_by(|&i, &j| inputs[i].payload_kg.to_bits() == inputs[j].payload_kg.to_bits())
         {
+            if jobs.len() < MANY {
+                few.extend_from_slice(jobs);
+                payloads += 1;
+            } else {
+                self.group(inputs, jobs, &common, Layout::SideBySide, set, ws, &mut results);
+            }
+        }
+        if payloads > 1 {
+            self.mixed(inputs, &mut few, &common, set, &mut results);
+        }
+        for jobs in few.chunk_by(|&i, &j| inputs[i].payload_kg.to_bits() == inputs[j].payload_kg.to_bits()) {
             let layout = if jobs.len() > 1 {
                 Layout::SideBySide
             } else {
@@ -125,6 +137,27 @@ impl PlanarModel {
             .into_iter()
             .map(|r| r.unwrap_or(Err(UNFINISHED)))
             .collect()
+    }
+
+    /// Simulates runs of several payloads side by side. Keeps in `jobs` those that are still to be done.
+    fn mixed(
+        &self,
+        inputs: &[RunInput],
+        jobs: &mut Vec<usize>,
+        common: &Common,
+        set: InstructionSet,
+        results: &mut [Option<RunResult>],
+    ) {
+        jobs.retain(|&job| match self.check(&inputs[job]) {
+            Ok(()) => true,
+            Err(bad) => {
+                results[job] = Some(Err(bad));
+                false
+            }
+        });
+        // The size that the modes of a boom with a payload need; larger bodies run one by one.
+        dispatch::mixed::<8, 8, 8>(set, self, common, inputs, jobs, results);
+        jobs.retain(|&job| results[job].is_none());
     }
 
     /// Simulates runs of one payload.
@@ -217,6 +250,10 @@ const UNFINISHED: RunFailure = RunFailure::NotFinite {
     quantity: "result",
     t_s: 0.0,
 };
+
+/// Runs of one payload from which on they share their modes: twice the lanes, since a group ends with lanes
+/// that wait for the last.
+const MANY: usize = 16;
 
 /// How the runs of a group share the registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -208,6 +208,11 @@ impl PlanarModel {
         self.payload.is_some()
     }
 
+    /// The cylinder.
+    pub(super) fn cylinder(&self) -> &Cylinder {
+        &self.cylinder
+    }
+
     /// Modes of the body with a payload.
     pub(super) fn modes(&self, payload_kg: f64) -> Result<Modes, NotPlanar> {
         let mut mass = self.mass_modal.clone();
@@ -240,7 +245,7 @@ impl PlanarModel {
         &self,
         modes: &Modes,
         order: &Order,
-    ) -> Option<Constants<A, B, Q>> {
+    ) -> Option<Constants<f64, A, B, Q>> {
         if order.coupled.len() > A || order.plain.len() > B || order.followers.len() > Q {
             return None;
         }
@@ -325,7 +330,7 @@ impl PlanarModel {
 
     /// Ranges that a run typically covers: pressures between tank and supply, the rod's speed with
     /// the valve open, a tenth of a second of it, and the energy of a body under the full force.
-    fn scale(&self, modes: &Modes) -> Scale {
+    fn scale(&self, modes: &Modes) -> Scale<f64> {
         let c = &self.cylinder;
         let range_pa = (c.supply_pa - c.tank_pa).max(1.0);
         let force_n = range_pa * c.area_m2[0];
@@ -453,7 +458,7 @@ struct Parts<'a> {
 }
 
 impl Parts<'_> {
-    fn set<const N: usize>(&self, modes: &[usize]) -> ModeSet<N> {
+    fn set<const N: usize>(&self, modes: &[usize]) -> ModeSet<f64, N> {
         let of = |row: &RowDVector<f64>| padded(modes, |k| row[k]);
         ModeSet {
             used: modes.len(),

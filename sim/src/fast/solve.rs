@@ -3,7 +3,7 @@
 
 use super::constants::{Constants, ModeSet};
 use super::dynamics::{PerMode, Point, Rates};
-use super::lane::Lane;
+use super::lane::{Coefficient, Lane};
 use super::sums::sums;
 
 /// Factors of one step, with s = γ step.
@@ -97,14 +97,15 @@ impl<L, const A: usize, const B: usize, const Q: usize> Factors<L, A, B, Q> {
 
 /// Linearises at `y`, where the right-hand side is `r`, for s = γ step.
 #[inline(always)]
-pub(super) fn factor<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+pub(super) fn factor<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     y: &Point<L, A, B, Q>,
     r: &Rates<L, A, B, Q>,
     s: L,
     f: &mut Factors<L, A, B, Q>,
 ) {
     let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     let one = k(1.0);
     let s2 = s * s;
     (f.s, f.s2) = (s, s2);
@@ -138,8 +139,8 @@ pub(super) fn factor<L: Lane, const A: usize, const B: usize, const Q: usize>(
     let mut dj = [k(0.0); A];
     let mut off = [k(0.0); A];
     for i in 0..coupled {
-        dj[i] = dn[0] * k(set.rod[0][i]) + dn[1] * k(set.rod[1][i]) + dn[2] * k(set.rod[2][i]);
-        f.k_tz[i] = gx * k(set.weight[1][i]) - gy * k(set.weight[0][i]) + r.force * dj[i];
+        dj[i] = dn[0] * q(set.rod[0][i]) + dn[1] * q(set.rod[1][i]) + dn[2] * q(set.rod[2][i]);
+        f.k_tz[i] = gx * q(set.weight[1][i]) - gy * q(set.weight[0][i]) + r.force * dj[i];
         off[i] = r.h[i] + s2 * f.k_tz[i];
         f.ratio.0[i] = off[i] * f.inverse.coupled[i];
         f.j_inverse.0[i] = f.j.coupled[i] * f.inverse.coupled[i];
@@ -203,7 +204,7 @@ pub(super) fn factor<L: Lane, const A: usize, const B: usize, const Q: usize>(
     f.d_star_jd = d_star * f.jd;
     f.weight = s * (d_star + s * f.k_star);
     f.weight_t = s2 * f.d_star_jd;
-    f.lag = s / (one + s * k(c.lag_per_s));
+    f.lag = s / (one + s * c.lag_per_s.pack());
 
     f.gt = (r.jt - f.ratio_j) * f.schur;
     f.jg = (r.jt - f.ratio_j) * f.gt + f.j_j;
@@ -212,8 +213,8 @@ pub(super) fn factor<L: Lane, const A: usize, const B: usize, const Q: usize>(
 
 /// J and the reciprocal diagonal of modes.
 #[inline(always)]
-fn diagonal<L: Lane, const N: usize>(
-    set: &ModeSet<N>,
+fn diagonal<L: Lane, K: Coefficient<L>, const N: usize>(
+    set: &ModeSet<K, N>,
     s: L,
     s2: L,
     n: [L; 3],
@@ -221,29 +222,29 @@ fn diagonal<L: Lane, const N: usize>(
     inverse: &mut [L; N],
 ) {
     let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     for i in 0..L::trip(N, set.used) {
-        j[i] = n[0] * k(set.rod[0][i]) + n[1] * k(set.rod[1][i]) + n[2] * k(set.rod[2][i]);
-        inverse[i] = k(1.0) / (k(1.0) + s * k(set.d[i]) + s2 * k(set.w2[i]));
+        j[i] = n[0] * q(set.rod[0][i]) + n[1] * q(set.rod[1][i]) + n[2] * q(set.rod[2][i]);
+        inverse[i] = k(1.0) / (k(1.0) + s * q(set.d[i]) + s2 * q(set.w2[i]));
     }
 }
 
 /// Solves (1/s − Jacobian) u = rhs. `r0` holds the step's linearisation point; θ and z of `rhs` and
 /// `u` are positions, ω and v rates.
 #[inline(always)]
-pub(super) fn solve<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+pub(super) fn solve<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     f: &Factors<L, A, B, Q>,
     r0: &Rates<L, A, B, Q>,
     rhs: &Point<L, A, B, Q>,
     u: &mut Point<L, A, B, Q>,
 ) {
-    let k = |x: f64| L::splat(x);
     let (s, s2) = (f.s, f.s2);
     let coupled = L::trip(A, c.coupled.used);
     let plain = L::trip(B, c.plain.used);
     let follower = L::trip(Q, c.follower.used);
     // s r_v − s² w² r_z of every mode
-    let own = |set_w2: f64, z: L, v: L| s * v - s2 * (k(set_w2) * z);
+    let own = |set_w2: K, z: L, v: L| s * v - s2 * (set_w2.pack() * z);
     let mut e = PerMode::<L, A, B, Q>::zero();
     for i in 0..coupled {
         e.coupled[i] = own(c.coupled.w2[i], rhs.z.coupled[i], rhs.v.coupled[i]);
@@ -312,5 +313,5 @@ pub(super) fn solve<L: Lane, const A: usize, const B: usize, const Q: usize>(
     }
     let d_force =
         r0.slopes.damping * d_speed + r0.slopes.spring * d_length + (f.area[1] * u.p[1] - f.area[0] * u.p[0]);
-    u.lag = f.lag * (rhs.lag + d_force * k(c.lag_per_s));
+    u.lag = f.lag * (rhs.lag + d_force * c.lag_per_s.pack());
 }

@@ -20,7 +20,7 @@ const ITERATIONS: usize = 60;
 
 /// Finds the equilibrium with the cylinder as long as it is at `angle_rad` undeformed.
 pub(super) fn rest<const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+    c: &Constants<f64, A, B, Q>,
     angle_rad: f64,
 ) -> Result<Rest<A, B, Q>, RunFailure> {
     let shut = Regime {
@@ -34,7 +34,7 @@ pub(super) fn rest<const A: usize, const B: usize, const Q: usize>(
     y.p = [c.cylinder.initial_pa; 2];
     let mut r = Rates::zero();
     let at = |y: &Point<f64, A, B, Q>, r: &mut Rates<f64, A, B, Q>| {
-        evaluate::<false, f64, A, B, Q>(c, y, &Heading::new(y.theta), 0.0, &shut, r);
+        evaluate::<false, f64, f64, A, B, Q>(c, y, &Heading::new(y.theta), 0.0, &shut, r);
     };
     at(&y, &mut r);
     let length_m = r.length;
@@ -71,7 +71,13 @@ pub(super) fn rest<const A: usize, const B: usize, const Q: usize>(
 }
 
 /// Static deflection of modes under their weight and the cylinder's force.
-fn deflect<const N: usize>(set: &ModeSet<N>, gravity: [f64; 2], force: f64, n: [f64; 3], z: &mut [f64; N]) {
+fn deflect<const N: usize>(
+    set: &ModeSet<f64, N>,
+    gravity: [f64; 2],
+    force: f64,
+    n: [f64; 3],
+    z: &mut [f64; N],
+) {
     for i in 0..set.used {
         let weight = gravity[0] * set.weight[0][i] + gravity[1] * set.weight[1][i] + set.weight_axial[i];
         let j = n[0] * set.rod[0][i] + n[1] * set.rod[1][i] + n[2] * set.rod[2][i];
@@ -82,7 +88,7 @@ fn deflect<const N: usize>(set: &ModeSet<N>, gravity: [f64; 2], force: f64, n: [
 /// Pressures with A₂ p₂ − A₁ p₁ = `force_n`: the rod side keeps its initial pressure as long as the
 /// piston side stays between tank and supply.
 fn holding_pressures<const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+    c: &Constants<f64, A, B, Q>,
     force_n: f64,
 ) -> [f64; 2] {
     let cylinder = &c.cylinder;

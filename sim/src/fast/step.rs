@@ -2,7 +2,7 @@
 
 use super::constants::Constants;
 use super::dynamics::{Heading, LARGEST_TURN_RAD, PerMode, Point, Rates, Regime, evaluate};
-use super::lane::Lane;
+use super::lane::{Coefficient, Lane};
 use super::solve::{Factors, factor, solve};
 use super::sums::sums;
 use super::tableau::{STAGES, Tableau};
@@ -21,6 +21,8 @@ pub(super) struct StepBuffer<L, const A: usize, const B: usize, const Q: usize> 
     pub(super) alpha: L,
     /// Squared error estimate over tolerance-free scales.
     pub(super) error2: L,
+    /// Lowest and highest rod speed among the stages, m/s.
+    pub(super) speed_range: [L; 2],
     factors: Factors<L, A, B, Q>,
     increments: [Point<L, A, B, Q>; STAGES],
     rhs: Point<L, A, B, Q>,
@@ -35,6 +37,7 @@ impl<L: Lane, const A: usize, const B: usize, const Q: usize> StepBuffer<L, A, B
             next: Point::zero(),
             alpha: L::splat(0.0),
             error2: L::splat(0.0),
+            speed_range: [L::splat(0.0); 2],
             factors: Factors::zero(),
             increments: [Point::zero(); STAGES],
             rhs: Point::zero(),
@@ -44,8 +47,8 @@ impl<L: Lane, const A: usize, const B: usize, const Q: usize> StepBuffer<L, A, B
 
 /// Steps from `y` by `h`: fills `next`, `error2`, and the rates at both ends.
 #[inline(always)]
-pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+pub(super) fn step<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     method: &Tableau,
     y: &Point<L, A, B, Q>,
     h: L,
@@ -53,7 +56,7 @@ pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
     w: &mut StepBuffer<L, A, B, Q>,
 ) {
     let heading = Heading::new(y.theta);
-    evaluate::<true, _, A, B, Q>(c, y, &heading, regime.opening, regime, &mut w.start);
+    evaluate::<true, _, _, A, B, Q>(c, y, &heading, regime.opening, regime, &mut w.start);
     factor(c, y, &w.start, h * L::splat(method.gamma), &mut w.factors);
     let inverse_h = L::splat(1.0) / h;
     let slopes = &w.start.slopes;
@@ -62,13 +65,23 @@ pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
         h * regime.opening_per_s * slopes.gain[1] * slopes.stiffness[1],
     ];
     w.next = *y;
+    w.speed_range = [w.start.speed; 2];
     for stage in 0..method.stages {
+        // Otherwise the compiler broadcasts all constants once, before the loop over the steps, and keeps the
+        // hundreds of packs on the stack, where they drive the state out of the first-level cache.
+        let c = std::hint::black_box(c);
         gather(c, method, stage, y, inverse_h, w);
         let at = if stage == 0 {
             &w.start
         } else {
             let opening = regime.opening + L::splat(method.time[stage]) * h * regime.opening_per_s;
-            evaluate::<false, _, A, B, Q>(c, &w.next, &heading, opening, regime, &mut w.end);
+            evaluate::<false, _, _, A, B, Q>(c, &w.next, &heading, opening, regime, &mut w.end);
+            let [low, high] = w.speed_range;
+            let speed = w.end.speed;
+            w.speed_range = [
+                speed.where_less(speed, low, low),
+                speed.where_less(high, speed, high),
+            ];
             &w.end
         };
         w.rhs.theta += w.next.omega;
@@ -102,8 +115,8 @@ pub(super) fn step<L: Lane, const A: usize, const B: usize, const Q: usize>(
 
 /// Adds `b` to `a`.
 #[inline(always)]
-fn plus<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn plus<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     a: &mut PerMode<L, A, B, Q>,
     b: &PerMode<L, A, B, Q>,
 ) {
@@ -120,8 +133,8 @@ fn plus<L: Lane, const A: usize, const B: usize, const Q: usize>(
 
 /// Argument of the stage into `next`, Σ c/h u into `rhs`.
 #[inline(always)]
-fn gather<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn gather<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     method: &Tableau,
     stage: usize,
     y: &Point<L, A, B, Q>,
@@ -259,33 +272,33 @@ impl<L: Lane> Weights<'_, L> {
 
 /// Σ (error / scale)² over pressures, rod travel, rod speed and strain energy.
 #[inline(always)]
-fn error2<L: Lane, const A: usize, const B: usize, const Q: usize>(
-    c: &Constants<A, B, Q>,
+fn error2<L: Lane, K: Coefficient<L>, const A: usize, const B: usize, const Q: usize>(
+    c: &Constants<K, A, B, Q>,
     w: &StepBuffer<L, A, B, Q>,
 ) -> L {
-    let k = |x: f64| L::splat(x);
+    let q = |x: K| x.pack();
     // The last increment of a stiffly accurate method is the difference to the embedded one.
     let u = &w.increments[w.increments.len() - 1];
     let j = w.factors.lengths();
     let a = sums!(L::trip(A, c.coupled.used), |i| {
         let (z, v) = (u.z.coupled[i], u.v.coupled[i]);
-        [j.coupled[i] * z, j.coupled[i] * v, z * z * k(c.coupled.w2[i])]
+        [j.coupled[i] * z, j.coupled[i] * v, z * z * q(c.coupled.w2[i])]
     });
     let b = sums!(L::trip(B, c.plain.used), |i| {
         let (z, v) = (u.z.plain[i], u.v.plain[i]);
-        [j.plain[i] * z, j.plain[i] * v, z * z * k(c.plain.w2[i])]
+        [j.plain[i] * z, j.plain[i] * v, z * z * q(c.plain.w2[i])]
     });
     let [follower] = sums!(L::trip(Q, c.follower.used), |i| {
         let z = u.z.follower[i];
-        [z * z * k(c.follower.w2[i])]
+        [z * z * q(c.follower.w2[i])]
     });
     let jt = w.start.jt;
-    let travel = (a[0] + b[0] + jt * u.theta) * k(c.scale.per_m);
-    let speed = (a[1] + b[1] + jt * u.omega) * k(c.scale.per_m_per_s);
-    let turn = jt * u.theta * k(c.scale.per_m);
-    let spin = jt * u.omega * k(c.scale.per_m_per_s);
-    let p = [u.p[0] * k(c.scale.per_pa), u.p[1] * k(c.scale.per_pa)];
-    (a[2] + b[2] + follower) * k(c.scale.per_j)
+    let travel = (a[0] + b[0] + jt * u.theta) * q(c.scale.per_m);
+    let speed = (a[1] + b[1] + jt * u.omega) * q(c.scale.per_m_per_s);
+    let turn = jt * u.theta * q(c.scale.per_m);
+    let spin = jt * u.omega * q(c.scale.per_m_per_s);
+    let p = [u.p[0] * q(c.scale.per_pa), u.p[1] * q(c.scale.per_pa)];
+    (a[2] + b[2] + follower) * q(c.scale.per_j)
         + (travel * travel + speed * speed)
         + (turn * turn + spin * spin)
         + (p[0] * p[0] + p[1] * p[1])

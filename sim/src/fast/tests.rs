@@ -70,7 +70,7 @@ type Numbered = Point<f64, 8, 8, 8>;
 struct Fixture {
     cloud: Cloud,
     modes: Modes,
-    constants: Constants<8, 8, 8>,
+    constants: Constants<f64, 8, 8, 8>,
     stiffness: DMatrix<f64>,
     damping: DMatrix<f64>,
 }
@@ -122,9 +122,14 @@ fn random_state(seed: u64) -> Numbered {
     y
 }
 
-fn rates_at(c: &Constants<8, 8, 8>, y: &Numbered, opening: f64, regime: &Regime<f64>) -> Rates<f64, 8, 8, 8> {
+fn rates_at(
+    c: &Constants<f64, 8, 8, 8>,
+    y: &Numbered,
+    opening: f64,
+    regime: &Regime<f64>,
+) -> Rates<f64, 8, 8, 8> {
     let mut r = Rates::zero();
-    evaluate::<true, _, 8, 8, 8>(c, y, &Heading::new(y.theta), opening, regime, &mut r);
+    evaluate::<true, _, _, 8, 8, 8>(c, y, &Heading::new(y.theta), opening, regime, &mut r);
     r
 }
 
@@ -200,7 +205,7 @@ fn inertia_and_applied_forces_balance_node_by_node() {
 }
 
 /// All of state and rates as one list: θ, z, ω, v, lagged force, pressures.
-fn pack(c: &Constants<8, 8, 8>, y: &Numbered) -> DVector<f64> {
+fn pack(c: &Constants<f64, 8, 8, 8>, y: &Numbered) -> DVector<f64> {
     let modes = |x: &PerMode<f64, 8, 8, 8>| {
         let mut all = x.coupled[..c.coupled.used].to_vec();
         all.extend_from_slice(&x.plain[..c.plain.used]);
@@ -216,7 +221,7 @@ fn pack(c: &Constants<8, 8, 8>, y: &Numbered) -> DVector<f64> {
     DVector::from_vec(x)
 }
 
-fn unpack(c: &Constants<8, 8, 8>, x: &DVector<f64>) -> Numbered {
+fn unpack(c: &Constants<f64, 8, 8, 8>, x: &DVector<f64>) -> Numbered {
     let mut from = x.iter().copied();
     let mut y = Point::zero();
     let modes = |from: &mut dyn Iterator<Item = f64>, to: &mut PerMode<f64, 8, 8, 8>| {
@@ -235,7 +240,7 @@ fn unpack(c: &Constants<8, 8, 8>, x: &DVector<f64>) -> Numbered {
     y
 }
 
-fn rates(c: &Constants<8, 8, 8>, x: &DVector<f64>) -> DVector<f64> {
+fn rates(c: &Constants<f64, 8, 8, 8>, x: &DVector<f64>) -> DVector<f64> {
     let y = unpack(c, x);
     let r = rates_at(c, &y, 0.4, &regime());
     let change = Point {

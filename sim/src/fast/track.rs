@@ -11,6 +11,23 @@ use hydroflex_openapi::job::RunFlag;
 const ATTEMPTS: u32 = 2000;
 /// Shortest step, s: a hundred thousandth of the fastest oil transient.
 const SHORTEST_S: f64 = 1e-9;
+/// Part of the pressure range around a chamber's line in which a step may end with a twelfth of the usual
+/// error only: the flow's slope has no bound at equal pressures, and the estimate, which comes from the
+/// same stages, sees little of it. The same where a step crosses the line.
+const LINE_BAND: f64 = 0.03;
+const LINE_CAUTION: f64 = 12.0;
+/// Friction turns over within its transition velocity, often within one step, and its force is too
+/// small for the error estimate to see; the acceleration at the end of the step sees it. So the last step
+/// before a sample may change the speed by at most this many transition velocities …
+const REVERSAL_MOST: f64 = 0.7;
+/// … if the speed came closer to zero than this many, and ends within that many; farther away the
+/// acceleration has recovered.
+const REVERSAL_TOUCHES: f64 = 1.2;
+const REVERSAL_ENDS: f64 = 6.0;
+/// Change of speed, in transition velocities, that is left for the last step when another is cut.
+const REVERSAL_LEAVES: f64 = 0.4;
+/// Steps shorter than this are not cut for friction, s.
+const REVERSAL_SHORTEST_S: f64 = 1e-5;
 /// A constraint that switches this close to the start of a step switches at its start, s.
 const SWITCH_S: f64 = 1e-6;
 
@@ -54,6 +71,10 @@ pub(super) struct Outcome {
     pub(super) rate: [[f64; 2]; 2],
     /// Angular acceleration at the end, rad/s².
     pub(super) alpha: f64,
+    /// Rod speed at the end, m/s.
+    pub(super) speed_m_per_s: f64,
+    /// Lowest and highest rod speed among the stages, m/s.
+    pub(super) speed_range_m_per_s: [f64; 2],
     /// Length at the end, m.
     pub(super) length_m: f64,
     /// Whether every number of the new state is finite.
@@ -178,13 +199,18 @@ impl<'a> Track<'a> {
     pub(super) fn judge(&mut self, outcome: &Outcome, cylinder: &Cylinder) -> Result<Verdict, RunFailure> {
         self.attempts += 1;
         self.statistics.factorisations += 1;
+        let error2 = if self.meets_line(outcome, cylinder) {
+            outcome.error2 * (LINE_CAUTION * LINE_CAUTION)
+        } else {
+            outcome.error2
+        };
         // Written so that a NaN is a rejection.
-        let passed = outcome.finite && outcome.error2 <= 1.0;
+        let passed = outcome.finite && error2 <= 1.0;
         // error^(-1/4) from its square; the estimate's order is 3 or 4.
-        let ideal = 0.9 / outcome.error2.max(1e-12).sqrt().sqrt().sqrt();
+        let ideal = 0.9 / error2.max(1e-12).sqrt().sqrt().sqrt();
         if !passed {
             self.statistics.rejected += 1;
-            let factor = if outcome.finite && outcome.error2.is_finite() {
+            let factor = if outcome.finite && error2.is_finite() {
                 ideal.clamp(0.1, 0.7)
             } else {
                 0.2
@@ -195,6 +221,10 @@ impl<'a> Track<'a> {
             self.statistics.rejected += 1;
             let shorter = (self.step_s * part).max(SWITCH_S);
             return self.retry(shorter.min(self.step_s), outcome);
+        }
+        if let Some(part) = self.reverses(outcome, cylinder) {
+            self.statistics.rejected += 1;
+            return self.retry(self.step_s * part, outcome);
         }
         self.statistics.steps += 1;
         self.at_s += self.step_s;
@@ -238,6 +268,36 @@ impl<'a> Track<'a> {
         }
         self.suggested_s = step_s;
         Ok(Verdict::Repeat)
+    }
+
+    /// Whether a chamber ends close to the pressure of its line, or passes it, with the valve open.
+    fn meets_line(&self, outcome: &Outcome, cylinder: &Cylinder) -> bool {
+        let shut = self.shut || (self.piece.from == 0.0 && self.piece.to == 0.0);
+        if shut {
+            return false;
+        }
+        let (_, _, lines) = self.valve_state(cylinder);
+        let band = LINE_BAND * (cylinder.supply_pa - cylinder.tank_pa);
+        (0..2).any(|i| {
+            let before = lines[i] - outcome.pressure_pa[0][i];
+            let after = lines[i] - outcome.pressure_pa[1][i];
+            !self.empty[i] && (after.abs() < band || before * after < 0.0)
+        })
+    }
+
+    /// Looks for friction that turns over in a step that ends at a sample. Returns the part of the step
+    /// to take first, if it must be repeated.
+    fn reverses(&self, outcome: &Outcome, cylinder: &Cylinder) -> Option<f64> {
+        let width = cylinder.reversal_m_per_s;
+        let at_sample = self.later.is_none() && self.step_s >= self.piece.length_s - self.at_s;
+        if width <= 0.0 || !at_sample || self.step_s < REVERSAL_SHORTEST_S {
+            return None;
+        }
+        let [low, high] = outcome.speed_range_m_per_s.map(|v| v / width);
+        let change = high - low;
+        let touches = low < REVERSAL_TOUCHES && high > -REVERSAL_TOUCHES;
+        let ends = outcome.speed_m_per_s.abs() < REVERSAL_ENDS * width;
+        (touches && ends && change > REVERSAL_MOST).then(|| (1.0 - REVERSAL_LEAVES / change).clamp(0.3, 0.95))
     }
 
     /// Looks for a chamber that reaches vapour pressure or leaves it within the step. Returns the

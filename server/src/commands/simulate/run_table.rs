@@ -7,10 +7,10 @@ use arrow::array::{
 };
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
+use hydroflex_dataset::guard;
 use hydroflex_openapi::machine::MachineFile;
 use hydroflex_sim::trajectory::RunInput;
 use parquet::arrow::ArrowWriter;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::Path;
@@ -22,8 +22,8 @@ use std::sync::Arc;
 /// Names the column, the row and the value at fault.
 pub(super) fn read(path: &Path, machine: &MachineFile) -> anyhow::Result<Vec<RunInput>> {
     let file = File::open(path).with_context(|| format!("run table {}", path.display()))?;
-    let reader = ParquetRecordBatchReaderBuilder::try_new(file)
-        .and_then(ParquetRecordBatchReaderBuilder::build)
+    let reader = guard::open_parquet(file)
+        .and_then(guard::batches)
         .with_context(|| format!("{} is not a Parquet file", path.display()))?;
     let mut runs = Vec::new();
     for batch in reader {

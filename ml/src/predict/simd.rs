@@ -1,0 +1,382 @@
+//! Vectors of f32 and f64 for the kernels: one source, compiled for AVX-512, AVX2 + FMA and the
+//! target's baseline, chosen once per process.
+//!
+//! The methods are instructions, nothing else. A kernel is generic over [`Simd`], is inlined into a
+//! function that enables the instructions (see [`dispatch`]), and so becomes code for them.
+
+#![allow(
+    unsafe_code,
+    unsafe_op_in_unsafe_fn,
+    clippy::inline_always,
+    clippy::needless_range_loop,
+    reason = "instructions beyond the baseline are unsafe to name, and have to be inlined to be one instruction each"
+)]
+
+/// Instruction sets with a kernel of their own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Level {
+    /// AVX-512F.
+    Avx512,
+    /// AVX2 and FMA.
+    Avx2,
+    /// The target's baseline.
+    Portable,
+}
+
+/// The kernel that this process uses.
+#[must_use]
+pub fn level() -> Level {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::is_x86_feature_detected as has;
+        if has!("avx512f") && has!("avx512vl") && has!("avx2") && has!("fma") {
+            return Level::Avx512;
+        }
+        if has!("avx2") && has!("fma") {
+            return Level::Avx2;
+        }
+    }
+    Level::Portable
+}
+
+/// Calls `$body::<S>($arguments)` compiled for the instruction set `$level`, which [`level`] found.
+macro_rules! dispatch {
+    ($level:expr, $owner:ident :: $body:ident ( $($name:ident : $type:ty),* $(,)? )) => {{
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx512f,avx512vl,avx2,fma")]
+        #[allow(unsafe_code, clippy::too_many_arguments, reason = "the features are enabled here")]
+        fn avx512($($name: $type),*) {
+            // SAFETY: the features that this type names are enabled in this function.
+            unsafe { $owner::$body::<$crate::predict::simd::Avx512>($($name),*) }
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma")]
+        #[allow(unsafe_code, clippy::too_many_arguments, reason = "the features are enabled here")]
+        fn avx2($($name: $type),*) {
+            // SAFETY: the features that this type names are enabled in this function.
+            unsafe { $owner::$body::<$crate::predict::simd::Avx2>($($name),*) }
+        }
+        match $level {
+            #[cfg(target_arch = "x86_64")]
+            #[allow(unsafe_code, reason = "the features were detected")]
+            // SAFETY: `level` returns this only where the features were detected.
+            $crate::predict::simd::Level::Avx512 => unsafe { avx512($($name),*) },
+            #[cfg(target_arch = "x86_64")]
+            #[allow(unsafe_code, reason = "the features were detected")]
+            // SAFETY: `level` returns this only where the features were detected.
+            $crate::predict::simd::Level::Avx2 => unsafe { avx2($($name),*) },
+            #[cfg(not(target_arch = "x86_64"))]
+            #[allow(unsafe_code, reason = "the baseline")]
+            // SAFETY: this type needs the target's baseline only.
+            $crate::predict::simd::Level::Avx512 | $crate::predict::simd::Level::Avx2 => unsafe {
+                $owner::$body::<$crate::predict::simd::Portable>($($name),*)
+            },
+            #[allow(unsafe_code, reason = "the baseline")]
+            // SAFETY: this type needs the target's baseline only.
+            $crate::predict::simd::Level::Portable => unsafe { $owner::$body::<$crate::predict::simd::Portable>($($name),*) },
+        }
+    }};
+}
+pub(super) use dispatch;
+
+/// Vectors of one instruction set.
+///
+/// # Safety
+/// Methods may be called only where the instructions that the implementing type names are there;
+/// pointers have to be valid for as many values as the vector has.
+pub(super) trait Simd: Copy {
+    /// [`Self::LANES`] values of f32.
+    type F: Copy;
+    /// Half as many values of f64.
+    type D: Copy;
+    /// Values of f32 in a vector.
+    const LANES: usize;
+    /// Outputs whose sums, two vectors each, fit into the registers.
+    const OUTPUTS: usize;
+    /// The same for f64.
+    const OUTPUTS_F64: usize;
+
+    unsafe fn splat(value: f32) -> Self::F;
+    unsafe fn load(from: *const f32) -> Self::F;
+    unsafe fn store(to: *mut f32, value: Self::F);
+    unsafe fn add(a: Self::F, b: Self::F) -> Self::F;
+    unsafe fn mul(a: Self::F, b: Self::F) -> Self::F;
+    unsafe fn div(a: Self::F, b: Self::F) -> Self::F;
+    /// `a b + c`, fused where the instruction exists: the library's fused form is slow elsewhere.
+    unsafe fn fma(a: Self::F, b: Self::F, c: Self::F) -> Self::F;
+    /// The larger one; `b` if either is not a number.
+    unsafe fn max(a: Self::F, b: Self::F) -> Self::F;
+    /// The smaller one; `b` if either is not a number.
+    unsafe fn min(a: Self::F, b: Self::F) -> Self::F;
+    /// 2ᵏ for `1.5·2²³ + k`, whose low bits are k, −126 ≤ k ≤ 127.
+    unsafe fn pow2(shifted: Self::F) -> Self::F;
+
+    unsafe fn splat_f64(value: f64) -> Self::D;
+    unsafe fn load_f64(from: *const f64) -> Self::D;
+    /// Loads half a vector of f32 and widens it.
+    unsafe fn widen(from: *const f32) -> Self::D;
+    unsafe fn store_f64(to: *mut f64, value: Self::D);
+    unsafe fn add_f64(a: Self::D, b: Self::D) -> Self::D;
+    unsafe fn fma_f64(a: Self::D, b: Self::D, c: Self::D) -> Self::D;
+}
+
+/// The target's baseline: arrays that the compiler makes vectors of.
+#[derive(Clone, Copy)]
+pub(super) struct Portable;
+
+#[inline(always)]
+fn zip<T: Copy, const N: usize>(a: [T; N], b: [T; N], f: impl Fn(T, T) -> T) -> [T; N] {
+    let mut out = a;
+    for lane in 0..N {
+        out[lane] = f(a[lane], b[lane]);
+    }
+    out
+}
+
+impl Simd for Portable {
+    type F = [f32; 4];
+    type D = [f64; 2];
+    const LANES: usize = 4;
+    const OUTPUTS: usize = 4;
+    const OUTPUTS_F64: usize = 4;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self::F {
+        [value; 4]
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self::F {
+        from.cast::<[f32; 4]>().read_unaligned()
+    }
+    #[inline(always)]
+    unsafe fn store(to: *mut f32, value: Self::F) {
+        to.cast::<[f32; 4]>().write_unaligned(value);
+    }
+    #[inline(always)]
+    unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
+        zip(a, b, |a, b| a + b)
+    }
+    #[inline(always)]
+    unsafe fn mul(a: Self::F, b: Self::F) -> Self::F {
+        zip(a, b, |a, b| a * b)
+    }
+    #[inline(always)]
+    unsafe fn div(a: Self::F, b: Self::F) -> Self::F {
+        zip(a, b, |a, b| a / b)
+    }
+    #[inline(always)]
+    unsafe fn fma(a: Self::F, b: Self::F, c: Self::F) -> Self::F {
+        Self::add(Self::mul(a, b), c)
+    }
+    #[inline(always)]
+    unsafe fn max(a: Self::F, b: Self::F) -> Self::F {
+        zip(a, b, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    unsafe fn min(a: Self::F, b: Self::F) -> Self::F {
+        zip(a, b, |a, b| if a < b { a } else { b })
+    }
+    #[inline(always)]
+    unsafe fn pow2(shifted: Self::F) -> Self::F {
+        zip(shifted, shifted, |value, _| {
+            f32::from_bits((value.to_bits() << 23).wrapping_add(1.0_f32.to_bits()))
+        })
+    }
+    #[inline(always)]
+    unsafe fn splat_f64(value: f64) -> Self::D {
+        [value; 2]
+    }
+    #[inline(always)]
+    unsafe fn load_f64(from: *const f64) -> Self::D {
+        from.cast::<[f64; 2]>().read_unaligned()
+    }
+    #[inline(always)]
+    unsafe fn widen(from: *const f32) -> Self::D {
+        let [a, b] = from.cast::<[f32; 2]>().read_unaligned();
+        [f64::from(a), f64::from(b)]
+    }
+    #[inline(always)]
+    unsafe fn store_f64(to: *mut f64, value: Self::D) {
+        to.cast::<[f64; 2]>().write_unaligned(value);
+    }
+    #[inline(always)]
+    unsafe fn add_f64(a: Self::D, b: Self::D) -> Self::D {
+        zip(a, b, |a, b| a + b)
+    }
+    #[inline(always)]
+    unsafe fn fma_f64(a: Self::D, b: Self::D, c: Self::D) -> Self::D {
+        Self::add_f64(zip(a, b, |a, b| a * b), c)
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub(super) use x86::{Avx2, Avx512};
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::Simd;
+    #[allow(clippy::wildcard_imports, reason = "every name begins with _mm")]
+    use std::arch::x86_64::*;
+
+    /// AVX2 and FMA.
+    #[derive(Clone, Copy)]
+    pub(in crate::predict) struct Avx2;
+
+    /// AVX-512F.
+    #[derive(Clone, Copy)]
+    pub(in crate::predict) struct Avx512;
+
+    impl Simd for Avx2 {
+        type F = __m256;
+        type D = __m256d;
+        const LANES: usize = 8;
+        const OUTPUTS: usize = 6;
+        const OUTPUTS_F64: usize = 6;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> Self::F {
+            _mm256_set1_ps(value)
+        }
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> Self::F {
+            _mm256_loadu_ps(from)
+        }
+        #[inline(always)]
+        unsafe fn store(to: *mut f32, value: Self::F) {
+            _mm256_storeu_ps(to, value);
+        }
+        #[inline(always)]
+        unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
+            _mm256_add_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn mul(a: Self::F, b: Self::F) -> Self::F {
+            _mm256_mul_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn div(a: Self::F, b: Self::F) -> Self::F {
+            _mm256_div_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn fma(a: Self::F, b: Self::F, c: Self::F) -> Self::F {
+            _mm256_fmadd_ps(a, b, c)
+        }
+        #[inline(always)]
+        unsafe fn max(a: Self::F, b: Self::F) -> Self::F {
+            _mm256_max_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn min(a: Self::F, b: Self::F) -> Self::F {
+            _mm256_min_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn pow2(shifted: Self::F) -> Self::F {
+            let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(shifted));
+            _mm256_castsi256_ps(_mm256_add_epi32(
+                exponent,
+                _mm256_castps_si256(_mm256_set1_ps(1.0)),
+            ))
+        }
+        #[inline(always)]
+        unsafe fn splat_f64(value: f64) -> Self::D {
+            _mm256_set1_pd(value)
+        }
+        #[inline(always)]
+        unsafe fn load_f64(from: *const f64) -> Self::D {
+            _mm256_loadu_pd(from)
+        }
+        #[inline(always)]
+        unsafe fn widen(from: *const f32) -> Self::D {
+            _mm256_cvtps_pd(_mm_loadu_ps(from))
+        }
+        #[inline(always)]
+        unsafe fn store_f64(to: *mut f64, value: Self::D) {
+            _mm256_storeu_pd(to, value);
+        }
+        #[inline(always)]
+        unsafe fn add_f64(a: Self::D, b: Self::D) -> Self::D {
+            _mm256_add_pd(a, b)
+        }
+        #[inline(always)]
+        unsafe fn fma_f64(a: Self::D, b: Self::D, c: Self::D) -> Self::D {
+            _mm256_fmadd_pd(a, b, c)
+        }
+    }
+
+    impl Simd for Avx512 {
+        type F = __m512;
+        type D = __m512d;
+        const LANES: usize = 16;
+        const OUTPUTS: usize = 12;
+        const OUTPUTS_F64: usize = 12;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> Self::F {
+            _mm512_set1_ps(value)
+        }
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> Self::F {
+            _mm512_loadu_ps(from)
+        }
+        #[inline(always)]
+        unsafe fn store(to: *mut f32, value: Self::F) {
+            _mm512_storeu_ps(to, value);
+        }
+        #[inline(always)]
+        unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
+            _mm512_add_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn mul(a: Self::F, b: Self::F) -> Self::F {
+            _mm512_mul_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn div(a: Self::F, b: Self::F) -> Self::F {
+            _mm512_div_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn fma(a: Self::F, b: Self::F, c: Self::F) -> Self::F {
+            _mm512_fmadd_ps(a, b, c)
+        }
+        #[inline(always)]
+        unsafe fn max(a: Self::F, b: Self::F) -> Self::F {
+            _mm512_max_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn min(a: Self::F, b: Self::F) -> Self::F {
+            _mm512_min_ps(a, b)
+        }
+        #[inline(always)]
+        unsafe fn pow2(shifted: Self::F) -> Self::F {
+            let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(shifted));
+            _mm512_castsi512_ps(_mm512_add_epi32(
+                exponent,
+                _mm512_castps_si512(_mm512_set1_ps(1.0)),
+            ))
+        }
+        #[inline(always)]
+        unsafe fn splat_f64(value: f64) -> Self::D {
+            _mm512_set1_pd(value)
+        }
+        #[inline(always)]
+        unsafe fn load_f64(from: *const f64) -> Self::D {
+            _mm512_loadu_pd(from)
+        }
+        #[inline(always)]
+        unsafe fn widen(from: *const f32) -> Self::D {
+            _mm512_cvtps_pd(_mm256_loadu_ps(from))
+        }
+        #[inline(always)]
+        unsafe fn store_f64(to: *mut f64, value: Self::D) {
+            _mm512_storeu_pd(to, value);
+        }
+        #[inline(always)]
+        unsafe fn add_f64(a: Self::D, b: Self::D) -> Self::D {
+            _mm512_add_pd(a, b)
+        }
+        #[inline(always)]
+        unsafe fn fma_f64(a: Self::D, b: Self::D, c: Self::D) -> Self::D {
+            _mm512_fmadd_pd(a, b, c)
+        }
+    }
+}
