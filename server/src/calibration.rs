@@ -35,6 +35,8 @@ pub fn job(spec: &JobSpec) -> Option<JobSpec> {
         seed: spec.seed.wrapping_add(SEED_OFFSET),
         settling_runs: 0,
         train: Vec::new(),
+        // Every column: the trainings choose.
+        columns: Vec::new(),
         ..spec.clone()
     })
 }

@@ -50,7 +50,12 @@ pub fn fault_rates(model: &Model, runs: &Runs) -> Result<Vec<FaultRate>, RunsErr
             EFFECT * (envelope.max[channel] - envelope.min[channel]) / crate::scheduled::RANGE_FACTOR;
         let mut rate = Rate::default();
         for run in &inputs.runs {
-            for first in (0..run.len().saturating_sub(stretch)).step_by(stretch) {
+            // A run shorter than a stretch is one.
+            let stretch = stretch.min(run.len());
+            if stretch <= steps {
+                continue;
+            }
+            for first in (0..=run.len() - stretch).step_by(stretch) {
                 let mut columns: Vec<Vec<f64>> = run
                     .columns
                     .iter()

@@ -6,6 +6,7 @@ use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
 use crate::predict::Predictor;
 use crate::runs::Runs;
+use crate::scheduled::RANGE_FACTOR;
 use crate::structure::parameter_count;
 use crate::train::Outcome;
 use crate::train::prepare::{Part, Problem, TrainingData};
@@ -24,6 +25,9 @@ use std::path::Path;
 const GOLDEN_WINDOWS: usize = 3;
 /// Version of the tensor framework, as in the workspace's manifest.
 const BURN_VERSION: &str = "0.22.1";
+/// Room around the training range of each input, relative to it: as far as our network follows.
+const ENVELOPE_MARGIN: f64 = 0.5 * (RANGE_FACTOR - 1.0);
+
 /// Room around the largest distance between estimate, or target, and guide on the training and validation runs …
 const GUARD_ROOM: f64 = 1.5;
 /// … and around the range of the targets, relative to it.
@@ -290,11 +294,22 @@ fn quasi_static(problem: &Problem) -> LinearWeights {
 fn envelope(problem: &Problem) -> (Envelope, LinearWeights) {
     let (projection, groups) =
         crate::envelope::projection(&problem.moments, &problem.spectrum, problem.spec.inputs.len());
-    let (min, max) = problem
-        .input_limits
-        .iter()
-        .map(|&[low, high]| (low, high))
-        .unzip();
+    let range = |input: usize| {
+        let values = || {
+            problem
+                .seen
+                .runs
+                .iter()
+                .flat_map(move |run| run.columns[input].iter().copied())
+        };
+        let (low, high) = (
+            values().fold(f64::INFINITY, f64::min),
+            values().fold(f64::NEG_INFINITY, f64::max),
+        );
+        let margin = ENVELOPE_MARGIN * (high - low);
+        (low - margin, high + margin)
+    };
+    let (min, max) = (0..problem.spec.inputs.len()).map(range).unzip();
     (
         Envelope {
             components: projection.bias.len(),
@@ -437,11 +452,7 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         inputs: problem.input_scaling.channels().to_vec(),
         targets: problem.target_scaling.channels().to_vec(),
         linear_skip: problem.structure.linear_skip,
-        input_limits: if problem.structure.linear_skip {
-            problem.input_limits.clone()
-        } else {
-            Vec::new()
-        },
+        input_limits: problem.input_limits.clone(),
         schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),
         guard: None,
         layers: final_layers(problem),

@@ -131,7 +131,7 @@ pub struct Problem {
     pub guide: LinearMap,
     /// What is minimised.
     pub loss: Loss,
-    /// Ranges of the inputs in their columns' units, within which windows are known and at which our network holds them.
+    /// Values at which inputs are held, in their columns' units; none for the paper's structures.
     pub input_limits: Vec<[f64; 2]>,
     /// Typical size of what the network learns, per target, in scaled units (1 without skip).
     pub wanted_scale: Vec<f64>,
@@ -294,7 +294,11 @@ impl Problem {
             part.wanted = in_units_of(&errors, &wanted_scale);
         }
 
-        let input_limits = input_limits(&seen, &calibration);
+        let input_limits = if structure.linear_skip {
+            input_limits(&seen)
+        } else {
+            Vec::new()
+        };
         let whitening = if published {
             Whitening::default()
         } else {
@@ -486,28 +490,19 @@ fn slow_inputs(inputs: &Runs) -> Vec<usize> {
     }
 }
 
-/// The range of each input over the training runs, widened as the slow signals' is, and over the calibration runs: long
-/// honest runs go a little farther than short ones.
-fn input_limits(seen: &Runs, calibration: &[(Runs, Runs)]) -> Vec<[f64; 2]> {
-    let range = |runs: &Runs, input: usize| {
-        let values = runs
-            .runs
-            .iter()
-            .flat_map(|run| run.columns[input].iter().copied());
-        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(value), high.max(value))
-        })
-    };
-    (0..seen.channels.len())
+/// The training range of each input, widened as the slow signals' is.
+fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
+    (0..runs.channels.len())
         .map(|input| {
-            let (low, high) = range(seen, input);
+            let values = || {
+                runs.runs
+                    .iter()
+                    .flat_map(|run| run.columns[input].iter().copied())
+            };
+            let low = values().fold(f64::INFINITY, f64::min);
+            let high = values().fold(f64::NEG_INFINITY, f64::max);
             let room = 0.5 * (RANGE_FACTOR - 1.0) * (high - low);
-            calibration
-                .iter()
-                .map(|(inputs, _)| range(inputs, input))
-                .fold([low - room, high + room], |[least, most], (low, high)| {
-                    [least.min(low), most.max(high)]
-                })
+            [low - room, high + room]
         })
         .collect()
 }
