@@ -14,6 +14,7 @@ use hydroflex_openapi::job::{Excitation, JobSpec};
 use hydroflex_sim::fe::read_abaqus;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario;
+use std::fmt::Write as _;
 use std::path::Path;
 
 #[path = "../server/tests/common/damage.rs"]
@@ -50,7 +51,7 @@ fn damaged_meshes_are_read_or_refused() {
     for k in 0..4 {
         for j in 0..4 {
             for i in 0..4 {
-                whole += &format!("{}, {}., {}., {}.\n", 1 + i + 4 * j + 16 * k, i, j, k);
+                writeln!(whole, "{}, {i}., {j}., {k}.", 1 + i + 4 * j + 16 * k).unwrap();
             }
         }
     }
@@ -130,9 +131,9 @@ fn damaged_data_sets_and_models_are_opened_or_refused() {
         while let Some(folder) = folders.pop() {
             for entry in std::fs::read_dir(folder).unwrap().flatten() {
                 if entry.path().is_dir() {
-                    folders.push(entry.path())
+                    folders.push(entry.path());
                 } else {
-                    found.push(entry.path())
+                    found.push(entry.path());
                 }
             }
         }

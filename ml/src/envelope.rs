@@ -20,9 +20,9 @@ use crate::predict::group_squares;
 use crate::predict::kernel::PackedLayer;
 use crate::window::{Series, Windows};
 use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt::factor::{cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{Mat, Par};
+use faer::{Mat, Par, Spec};
 use hydroflex_openapi::model::EnvelopeGroup;
 use rayon::prelude::*;
 
@@ -113,13 +113,13 @@ fn relations(moments: &WindowMoments, spectrum: &Spectrum, width: usize) -> Vec<
 
 /// `matrix⁻¹ right` of a positive definite matrix, on one thread so that the result does not depend on their number.
 fn solve(mut matrix: Mat<f64>, mut right: Mat<f64>) -> Option<Mat<f64>> {
-    let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Default::default());
+    let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Spec::default());
     cholesky_in_place(
         matrix.as_mut(),
-        Default::default(),
+        LltRegularization::default(),
         Par::Seq,
         MemStack::new(&mut MemBuffer::new(scratch)),
-        Default::default(),
+        Spec::default(),
     )
     .ok()?;
     solve_lower_triangular_in_place(matrix.as_ref(), right.as_mut(), Par::Seq);
@@ -139,10 +139,14 @@ fn shapes(steps: usize) -> Vec<Vec<f64>> {
             .collect();
         for before in &shapes {
             let part: f64 = shape.iter().zip(before).map(|(a, b)| a * b).sum();
-            shape.iter_mut().zip(before).for_each(|(a, b)| *a -= part * b);
+            for (a, b) in shape.iter_mut().zip(before) {
+                *a -= part * b;
+            }
         }
         let norm = shape.iter().map(|a| a * a).sum::<f64>().sqrt();
-        shape.iter_mut().for_each(|a| *a /= norm);
+        for a in &mut shape {
+            *a /= norm;
+        }
         shapes.push(shape);
     }
     shapes

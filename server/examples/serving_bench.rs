@@ -161,7 +161,7 @@ fn series(folder: &Path, rows: usize, calls: u32) -> anyhow::Result<()> {
         let found = predictor.predict_series_with(std::hint::black_box(&columns), &mut workspace);
         estimates = found.columns[0].len();
     }
-    let us = (computed()? - begun).as_secs_f64() * 1e6 / f64::from(calls);
+    let us = computed()?.saturating_sub(begun).as_secs_f64() * 1e6 / f64::from(calls);
     println!("{}", json!({ "us": us, "estimates": estimates }));
     Ok(())
 }

@@ -2,6 +2,7 @@
 
 #![allow(
     clippy::cast_possible_truncation,
+    clippy::type_complexity,
     clippy::unwrap_used,
     reason = "a test stops at what it did not expect; its numbers are small"
 )]

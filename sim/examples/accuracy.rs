@@ -6,7 +6,12 @@
 //! with all its terms; `--second` compares the first RUNS of each payload with the general path's
 //! trapezoidal rule too. Errors are the largest over a run, over the median range of the channel.
 
-#![allow(clippy::print_stdout, reason = "this program's output is its purpose")]
+#![allow(
+    clippy::print_stdout,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "this program's output is its purpose; its numbers are small"
+)]
 
 use hydroflex_openapi::job::{Integrator, JobSpec};
 use hydroflex_sim::fast::{PlanarModel, TOLERANCE, Workspace};

@@ -203,6 +203,7 @@ fn read(path: &Path) -> Result<Vec<u8>, ModelError> {
     })
 }
 
+#[allow(clippy::too_many_lines, reason = "one check after the other")]
 fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
     let config_error = |source| ModelError::Config {
         path: path.to_owned(),
@@ -287,7 +288,11 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
             || guard.min.len() != count
             || guard.max.len() != count
             || guard.slack.iter().any(|s| !(s.is_finite() && *s >= 0.0))
-            || guard.min.iter().zip(&guard.max).any(|(min, max)| !(min <= max))
+            || guard
+                .min
+                .iter()
+                .zip(&guard.max)
+                .any(|(min, max)| min.is_nan() || max.is_nan() || min > max)
     }) {
         return Err(inconsistent(
             "the bounds of the estimates must be ordered, one set per target",

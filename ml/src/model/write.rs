@@ -201,6 +201,10 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
 
 /// Bounds that nothing in the training or validation runs touches: neither the targets nor the estimates of
 /// `unlimited`, the model without bounds.
+#[allow(
+    clippy::needless_range_loop,
+    reason = "k counts windows, and every target has an estimate for each"
+)]
 fn guard(problem: &Problem, unlimited: &Predictor) -> Guard {
     let scaling = &problem.target_scaling;
     let targets = problem.spec.targets.len();

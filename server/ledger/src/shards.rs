@@ -294,7 +294,7 @@ impl Ledger {
             // A worker of another level has begun the same job a moment ago: nothing is taken.
             return Ok(None);
         }
-        let claim = Claim { job, shard };
+        let claim = Claim { shard, job };
         tx.commit().await?;
         Ok(Some(claim))
     }

@@ -95,7 +95,6 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         epochs: args.epochs,
         time_limit_s: args.time_limit_s,
         noise: args.noise,
-        ..TrainingSpec::default()
     };
     let long = match &args.calibration {
         Some(path) => Some(calm_runs(

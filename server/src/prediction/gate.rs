@@ -223,7 +223,7 @@ mod tests {
         let known = |work: Work| gate.byte_ps[work as usize].load(Ordering::Relaxed);
         assert!((90_000..=100_000).contains(&known(Work::Text)), "100 ns a byte");
         assert_eq!(known(Work::Bytes), 500);
-        gate.learn(Work::Bytes, 10_000, Duration::from_secs(3600));
+        gate.learn(Work::Bytes, 10_000, Duration::from_hours(1));
         assert!(known(Work::Bytes) <= 500 + BELIEVED_PS[1] / MEMORY);
         gate.learn(Work::Bytes, 10, Duration::from_secs(1));
         assert!(

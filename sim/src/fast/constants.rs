@@ -109,7 +109,6 @@ pub(super) struct Scale<K> {
 impl<L: Lane, const A: usize, const B: usize, const Q: usize> Constants<L, A, B, Q> {
     /// The same body in every lane.
     pub(super) fn splat(from: &Constants<f64, A, B, Q>) -> Self {
-        let all = |x: &f64| L::splat(*x);
         fn row<L: Lane, const N: usize>(from: &[f64; N]) -> [L; N] {
             from.map(L::splat)
         }
@@ -125,6 +124,7 @@ impl<L: Lane, const A: usize, const B: usize, const Q: usize> Constants<L, A, B,
                 moment: from.moment.map(|r| row(&r)),
             }
         }
+        let all = |x: &f64| L::splat(*x);
         let sensor = |from: &SensorRow<f64, A, B, Q>| SensorRow {
             coupled: row(&from.coupled),
             plain: row(&from.plain),

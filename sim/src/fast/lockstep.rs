@@ -148,6 +148,7 @@ impl<L: Lane + Coefficient<L>, const A: usize, const B: usize, const Q: usize> B
 }
 
 /// Simulates `inputs` in the order of `jobs` and puts each result into its place of `results`.
+#[allow(clippy::too_many_lines, reason = "one loop over the steps of all lanes")]
 #[inline(always)]
 pub(super) fn simulate<L: Lane, const A: usize, const B: usize, const Q: usize>(
     bodies: &mut impl Bodies<L, A, B, Q>,
