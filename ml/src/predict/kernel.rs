@@ -12,7 +12,7 @@
 //!   once.
 //!
 //! Both add the same products in the same order, fused alike: an estimate has the same bits whichever
-//! way it is computed and whatever stands beside it. A layer of few outputs ([`NARROW`]) has few
+//! way it is computed and whatever stands beside it. A layer of few outputs (`NARROW`) has few
 //! sums, each of which would wait for itself; it adds in four parts.
 
 #![allow(
