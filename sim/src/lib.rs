@@ -25,7 +25,6 @@ pub mod fast;
 pub mod tree;
 pub mod trajectory;
 pub mod linearise;
-mod loose_statics;
 mod general;
 pub mod simulator;
 pub mod summary;
