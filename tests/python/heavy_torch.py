@@ -35,11 +35,16 @@ class Slide(torch.nn.Module):
             terms = len(config["schedule"]["exponents"]) if config.get("schedule") else 1
             size = config["window_steps"] * len(config["inputs"])
             self.skip = torch.nn.Linear(size, terms * len(config["targets"]), dtype=torch.float64)
+        if config.get("guard"):
+            size = config["window_steps"] * len(config["inputs"])
+            self.guard = torch.nn.Linear(size, len(config["targets"]))
         self.config = config
 
     def forward(self, x, raw_last):
         """Scaled windows and the sensors at their ends to estimates in physical units."""
         config = self.config
+        # A model's inputs are f32: the linear map's large coefficients would show what rounding takes.
+        x = x.float().double()
         y = self.net(x.float()).double()
         if config["linear_skip"]:
             terms = self.skip(x).reshape(len(x), -1, len(config["targets"]))
@@ -51,6 +56,11 @@ class Slide(torch.nn.Module):
                     for column, exponent in enumerate(exponents):
                         factors[:, place] *= u[:, column] ** exponent
             y = y + (terms * factors[:, :, None]).sum(1)
+        if guard := config.get("guard"):
+            offset, scale = column_of(config["targets"], "offset"), column_of(config["targets"], "scale")
+            guide, slack = self.guard(x.float()).double(), torch.tensor(guard["slack"]) / scale
+            y = torch.clamp(y, guide - slack, guide + slack)
+            y = torch.clamp(y, (torch.tensor(guard["min"]) - offset) / scale, (torch.tensor(guard["max"]) - offset) / scale)
         return y * column_of(config["targets"], "scale") + column_of(config["targets"], "offset")
 
 
@@ -109,10 +119,11 @@ def check_model(folder, data, structure):
     ends = np.flatnonzero(samples["step"].to_numpy() >= steps - 1)
     ends = ends[estimates["inside_envelope"].to_numpy(zero_copy_only=False)[ends].astype(bool)]
     assert len(ends) > 100, f"{structure}: {len(ends)} windows inside the envelope"
-    scaled = (raw - column_of(config["inputs"], "offset")) / column_of(config["inputs"], "scale")
+    scaled = (raw - column_of(config["inputs"], "offset")) * (1 / column_of(config["inputs"], "scale"))
     windows = torch.stack([scaled[end - steps + 1 : end + 1].reshape(-1) for end in ends])
     with torch.no_grad():
-        found = module(windows, raw[ends]).numpy()
+        seen = scaled.float().double() * column_of(config["inputs"], "scale") + column_of(config["inputs"], "offset")
+        found = module(windows, seen[ends]).numpy()
     for place, target in enumerate(config["targets"]):
         ours = estimates[target["name"]].to_numpy()[ends]
         spread = np.ptp(samples[target["name"]].to_numpy())
