@@ -2,8 +2,7 @@
 batches, learning rates and numbers of threads. Run by `tests/heavy.sh --bench`.
 
 Both are timed as the difference between a long and a short training, so that reading and preparing do not count; rounds take
-turns, the median of the ratios is shown. Ours also validates now and then, PyTorch here does not. Two cores of a shared
-machine: the ratios count.
+turns, the median of the ratios is shown. Two cores of a shared machine: the ratios count.
 """
 import argparse
 import json
@@ -21,8 +20,9 @@ import torch
 HYDROFLEX = os.environ.get("HYDROFLEX_BIN", "target/release/hydroflex")
 ACTIVATIONS = {"tanh": torch.nn.Tanh, "sigmoid": torch.nn.Sigmoid, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
 WINDOW_STEPS, TARGET = 60, "deflection_tip_y_m"
-# Windows, batch, epochs of the short and of the long training.
-CASES = {"disjoint": (768, 10, 60), "overlapping": (1024, 1, 3)}
+# Windows, batch, epochs of the short and of the long training. A training validates fifty times, on all windows of the
+# validation runs, or after each epoch where it has fewer: both have at least fifty, so that it cancels out.
+CASES = {"disjoint": (768, 60, 160), "overlapping": (1024, 50, 60)}
 
 
 def ours(data, scratch, structure, windows, epochs, threads, seed):
