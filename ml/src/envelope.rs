@@ -13,16 +13,15 @@
 //! stands still does not. A linear relation is enough and holds farther from the training runs than a polynomial or a
 //! network of random features did (tried on the published boom).
 
+use crate::cholesky;
 use crate::evaluate::metrics::quantile;
 use crate::least_squares::{Spectrum, WindowMoments};
 use crate::model::weights::LinearWeights;
 use crate::predict::group_squares;
 use crate::predict::kernel::PackedLayer;
 use crate::window::{Series, Windows};
-use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{Mat, Par, Spec};
+use faer::{Mat, Par};
 use hydroflex_openapi::model::EnvelopeGroup;
 use rayon::prelude::*;
 
@@ -112,16 +111,8 @@ fn relations(moments: &WindowMoments, spectrum: &Spectrum, width: usize) -> Vec<
 }
 
 /// `matrix⁻¹ right` of a positive definite matrix, on one thread so that the result does not depend on their number.
-fn solve(mut matrix: Mat<f64>, mut right: Mat<f64>) -> Option<Mat<f64>> {
-    let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Spec::default());
-    cholesky_in_place(
-        matrix.as_mut(),
-        LltRegularization::default(),
-        Par::Seq,
-        MemStack::new(&mut MemBuffer::new(scratch)),
-        Spec::default(),
-    )
-    .ok()?;
+fn solve(matrix: Mat<f64>, mut right: Mat<f64>) -> Option<Mat<f64>> {
+    let matrix = cholesky::factor(matrix)?;
     solve_lower_triangular_in_place(matrix.as_ref(), right.as_mut(), Par::Seq);
     solve_upper_triangular_in_place(matrix.as_ref().transpose(), right.as_mut(), Par::Seq);
     Some(right)

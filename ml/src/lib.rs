@@ -33,6 +33,7 @@ pub mod window;
 pub mod scaling;
 pub mod structure;
 pub mod least_squares;
+mod cholesky;
 pub mod scheduled;
 pub mod envelope;
 pub mod noise;

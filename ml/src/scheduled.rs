@@ -21,15 +21,14 @@
 //! sums of exponents. Ordered by degree, the Cholesky factor of a smaller degree is the leading
 //! part of that of the largest, so one factorisation per ridge serves all degrees.
 
+use crate::cholesky;
 use crate::evaluate::metrics::quantile;
 use crate::least_squares::TargetRows;
 use crate::scaling::Scaling;
 use crate::window::{Series, Windows};
-use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{Accum, Mat, Par, Spec};
+use faer::{Accum, Mat, Par};
 use hydroflex_openapi::model::Schedule;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -386,16 +385,7 @@ impl<'a> Normal<'a> {
                 }
             }
         }
-        let scratch = cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Spec::default());
-        cholesky_in_place(
-            matrix.as_mut(),
-            LltRegularization::default(),
-            Par::Seq,
-            MemStack::new(&mut MemBuffer::new(scratch)),
-            Spec::default(),
-        )
-        .ok()?;
-        Some(matrix)
+        cholesky::factor(matrix)
     }
 
     /// One solution per degree from the factor of the largest.

@@ -60,6 +60,27 @@ pub struct PackedLayer {
     activations: Vec<Activation>,
 }
 
+/// The weights (row-major, a row per output) as tiles of `tile` outputs each, `[tile][input][outputs of the tile]`;
+/// each one is also handed to `into_group` with its output and input.
+pub(super) fn pack<T: Copy + Default>(
+    weights: &[T],
+    outputs: usize,
+    tile: usize,
+    mut into_group: impl FnMut(usize, usize, T),
+) -> Vec<T> {
+    let inputs = weights.len() / outputs.max(1);
+    let mut tiles = vec![T::default(); outputs * inputs];
+    for (output, row) in weights.chunks(inputs.max(1)).enumerate() {
+        let first = output - output % tile;
+        let width = tile.min(outputs - first);
+        for (input, &weight) in row.iter().enumerate() {
+            into_group(output, input, weight);
+            tiles[first * inputs + input * width + output - first] = weight;
+        }
+    }
+    tiles
+}
+
 impl PackedLayer {
     /// Packs `map`.
     ///
@@ -72,17 +93,9 @@ impl PackedLayer {
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
         let group_count = outputs.div_ceil(GROUP);
         let mut groups = vec![Lanes([0.0; GROUP]); group_count * inputs];
-        let mut tiles = vec![0.0; outputs * inputs];
-        for (output, row) in map.weight.chunks(inputs.max(1)).enumerate() {
-            let group = &mut groups[output / GROUP * inputs..];
-            let first = output - output % TILE;
-            let width = TILE.min(outputs - first);
-            let tile = &mut tiles[first * inputs..][..width * inputs];
-            for (input, &weight) in row.iter().enumerate() {
-                group[input].0[output % GROUP] = weight;
-                tile[input * width + output - first] = weight;
-            }
-        }
+        let tiles = pack(&map.weight, outputs, TILE, |output, input, weight| {
+            groups[output / GROUP * inputs + input].0[output % GROUP] = weight;
+        });
         let mut bias = map.bias.clone();
         bias.resize(group_count * GROUP, 0.0);
         Self {

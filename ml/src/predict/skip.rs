@@ -16,7 +16,7 @@
               load would double its cost: lengths are compared before the loops"
 )]
 
-use super::kernel::{Level, PANEL, level};
+use super::kernel::{Level, PANEL, level, pack};
 use super::simd::{Simd, dispatch};
 use crate::model::weights::SkipWeights;
 use hydroflex_openapi::model::{ScaledChannel, Schedule};
@@ -67,17 +67,9 @@ impl SkipKernel {
         let inputs = map.weight.len() / outputs.max(1);
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
         let mut groups = vec![[0.0; GROUP]; outputs.div_ceil(GROUP) * inputs];
-        let mut tiles = vec![0.0; outputs * inputs];
-        for (output, row) in map.weight.chunks(inputs.max(1)).enumerate() {
-            let group = &mut groups[output / GROUP * inputs..];
-            let first = output - output % TILE;
-            let width = TILE.min(outputs - first);
-            let tile = &mut tiles[first * inputs..][..width * inputs];
-            for (input, &weight) in row.iter().enumerate() {
-                group[input][output % GROUP] = weight;
-                tile[input * width + output - first] = weight;
-            }
-        }
+        let tiles = pack(&map.weight, outputs, TILE, |output, input, weight| {
+            groups[output / GROUP * inputs + input][output % GROUP] = weight;
+        });
         let mut bias = map.bias.clone();
         bias.resize(outputs.next_multiple_of(GROUP), 0.0);
         let slow = schedule.map_or_else(Vec::new, |schedule| {

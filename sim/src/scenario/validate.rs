@@ -230,22 +230,22 @@ fn split(spec: &JobSpec, errors: &mut Errors) {
     );
 }
 
-fn columns(spec: &JobSpec, channels: &[Channel], errors: &mut Errors) {
+/// A channel of the machine, named once.
+fn known_once(names: &[String], k: usize, pointer: &str, channels: &[Channel], errors: &mut Errors) {
+    let name = &names[k];
     let known: Vec<&str> = channels.iter().map(|c| c.name.as_str()).collect();
-    for (k, name) in spec.columns.iter().enumerate() {
-        let pointer = format!("/columns/{k}");
-        errors.require(
-            known.contains(&name.as_str()),
-            &pointer,
-            name,
-            format!("a channel of the machine: {}", known.join(", ")),
-        );
-        errors.require(
-            !spec.columns[..k].contains(name),
-            &pointer,
-            name,
-            "every channel once",
-        );
+    errors.require(
+        known.contains(&name.as_str()),
+        pointer,
+        name,
+        format!("a channel of the machine: {}", known.join(", ")),
+    );
+    errors.require(!names[..k].contains(name), pointer, name, "every channel once");
+}
+
+fn columns(spec: &JobSpec, channels: &[Channel], errors: &mut Errors) {
+    for k in 0..spec.columns.len() {
+        known_once(&spec.columns, k, &format!("/columns/{k}"), channels, errors);
     }
     errors.require(
         (1..=4096).contains(&spec.file_size_mb),
@@ -270,20 +270,13 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
     for (field, names) in [("inputs", &training.inputs), ("targets", &training.targets)] {
         for (k, name) in names.iter().enumerate() {
             let pointer = format!("{}/{k}", at(field));
-            let known: Vec<&str> = channels.iter().map(|c| c.name.as_str()).collect();
-            errors.require(
-                known.contains(&name.as_str()),
-                &pointer,
-                name,
-                format!("a channel of the machine: {}", known.join(", ")),
-            );
+            known_once(names, k, &pointer, channels, errors);
             errors.require(
                 spec.keeps(name),
                 &pointer,
                 name,
                 "a channel that the job keeps: see /columns",
             );
-            errors.require(!names[..k].contains(name), &pointer, name, "every channel once");
             errors.require(
                 field == "inputs" || !training.inputs.contains(name),
                 &pointer,
