@@ -1,7 +1,6 @@
 //! Data sets, trainings and models; names for models, and keys for people.
 
 use crate::{HASH, finish_runs, new_dataset, new_job, result};
-use futures::TryStreamExt;
 use hydroflex_ledger::keys::{self, Scope};
 use hydroflex_ledger::transition::ATTEMPT_LIMIT;
 use hydroflex_ledger::{AliasCondition, AliasMove, Created, IdempotencyKey, Ledger, NewModel};

@@ -1,7 +1,6 @@
 //! Jobs: accepted once, in order of urgency, done again where they failed.
 
 use crate::{new_dataset, new_job, result};
-use futures::TryStreamExt;
 use hydroflex_ledger::{CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, ShardResult};
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
