@@ -36,6 +36,9 @@ const BUSY_TICK: Duration = Duration::from_millis(50);
 const SWEEP: Duration = Duration::from_mins(1);
 /// And when there is none; whoever accepts a job calls.
 const IDLE_TICK: Duration = Duration::from_millis(500);
+/// Jobs whose data sets are written at a time while their runs are still simulated: each has the memory of
+/// a few row groups and files of its own.
+const MOST_EARLY: usize = 2;
 
 /// Where a coordinator keeps things, and how patient it is.
 #[derive(Debug, Clone)]
@@ -262,7 +265,13 @@ impl Coordinator {
                 );
             }
             match job.state {
-                JobState::Queued | JobState::Simulating => self.advance(&job, workers).await?,
+                JobState::Queued => self.advance(&job, workers).await?,
+                JobState::Simulating => {
+                    self.advance(&job, workers).await?;
+                    if self.publishes_fewer_than(MOST_EARLY) {
+                        self.publish_in_background(job, tasks);
+                    }
+                }
                 // Incomplete again if an object turned out damaged and its shard is done anew.
                 JobState::Publishing if job.is_complete() => self.publish_in_background(job, tasks),
                 _ => {}
@@ -339,6 +348,13 @@ impl Coordinator {
                 .await?;
         }
         Ok(())
+    }
+
+    fn publishes_fewer_than(&self, most: usize) -> bool {
+        self.0
+            .publishing
+            .lock()
+            .is_ok_and(|publishing| publishing.len() < most)
     }
 
     fn publish_in_background(&self, job: JobRecord, tasks: &mut tokio::task::JoinSet<()>) {
