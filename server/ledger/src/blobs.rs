@@ -378,6 +378,23 @@ impl Blobs {
         Ok(deleted)
     }
 
+    /// Removes the folders of a directory that deleted objects have left empty, and the folder of the key with
+    /// them; object stores have none.
+    pub fn remove_empty_folders(&self, key: &str) {
+        fn remove(folder: &Path) {
+            for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+                if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                    remove(&entry.path());
+                }
+            }
+            // One that is not empty stays, and so does what is put into it meanwhile.
+            let _ = std::fs::remove_dir(folder);
+        }
+        if let Some(path) = self.local_path(key) {
+            remove(&path);
+        }
+    }
+
     /// Names of the folders directly below a key.
     ///
     /// # Errors

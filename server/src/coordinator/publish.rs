@@ -31,8 +31,8 @@ use tokio::sync::mpsc;
 /// processes and times; they are in the job's events, because a data set holds neither.
 const GIVEN_UP: &str = "given up: every attempt ended with the worker's failure";
 
-/// Shards read ahead of the writer.
-const READ_AHEAD: usize = 4;
+/// Shards that wait for the writer, beside the one that is read: they may have 64 MiB each.
+const READ_AHEAD: usize = 1;
 
 /// How often the ledger is asked for the next shard while it is still simulated.
 const POLL: Duration = Duration::from_millis(20);
@@ -165,6 +165,8 @@ async fn publish_if_wanted(coordinator: &Coordinator, job: &JobRecord) -> Result
             sha256: file.sha256.clone(),
         })
         .collect();
+    // From here on until the job is over, what lies under the data set's name is no orphan.
+    coordinator.ledger().announce_upload(job.id, &id).await?;
     for (number, file) in files.iter().enumerate() {
         let key = format!("datasets/{id}/{}", file.path);
         coordinator
