@@ -2,14 +2,15 @@
 //!
 //! A loosely converged start is visible in what follows (a first acceleration of 0.03 rad/s² instead of zero), so a run that
 //! is to equal a published one has to stop at the same iterate. That takes the same unknowns (Euler parameters and
-//! multipliers), the same norm over them and the same Jacobian: stiffness of the modes, tangent of the cylinders' forces
-//! and constraint rows; neither derivatives of the loads nor of the constraint forces (theory note §9 and §10.4).
+//! multipliers), the same norm over them and the same Jacobian: stiffness of the modes, tangents of the cylinders' forces
+//! and of gravity, and constraint rows, without the derivative of the constraint forces (theory note §9 and §10.4; found by
+//! inverting what `MainSolverStatic.GetSystemJacobian` of Exudyn 1.13.6 returns).
 
 use hydroflex_openapi::machine::LooseStatics;
-use nalgebra::{DMatrix, DVector, Matrix3x4, Vector3, Vector4, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3, Vector4, Vector6};
 
 use crate::body::marker::{BodyMarker, Marker};
-use crate::body::rotation::rate_map;
+use crate::body::rotation::{rate_map, rotation_matrix};
 use crate::equilibrium::EquilibriumError;
 use crate::joint::RowSink;
 use crate::system::{DenseLu, Level, Oil, State, System, Workspace};
@@ -143,7 +144,7 @@ impl<'a> LooseNewton<'a> {
                     });
                 }
                 iteration += 1;
-                self.iterate(state, ws)?;
+                self.iterate(load, state, ws)?;
                 residual = self.evaluate(load, state, ws);
                 if stopping.is_met(iteration, residual) {
                     break;
@@ -245,9 +246,9 @@ impl<'a> LooseNewton<'a> {
     }
 
     /// One step of Newton's method from the last evaluation.
-    fn iterate(&mut self, state: &mut State, ws: &Workspace) -> Result<(), EquilibriumError> {
+    fn iterate(&mut self, load: f64, state: &mut State, ws: &Workspace) -> Result<(), EquilibriumError> {
         let (coordinates, rows) = (self.system.coordinate_count, self.system.row_count());
-        self.fill_jacobian(state, ws);
+        self.fill_jacobian(load, state, ws);
         if !self.jacobian.factorise() {
             return Err(EquilibriumError::NotHeld);
         }
@@ -273,7 +274,7 @@ impl<'a> LooseNewton<'a> {
         Ok(())
     }
 
-    fn fill_jacobian(&mut self, state: &State, ws: &Workspace) {
+    fn fill_jacobian(&mut self, load: f64, state: &State, ws: &Workspace) {
         let system = self.system;
         let (coordinates, rows) = (system.coordinate_count, system.row_count());
         let order = self.residual.len();
@@ -313,8 +314,41 @@ impl<'a> LooseNewton<'a> {
                 }
             }
         }
+        self.add_gravity_tangent(load, state, ws);
         for cylinder in 0..system.cylinders.len() {
             self.add_cylinder_tangent(cylinder, state, ws);
+        }
+    }
+
+    /// Derivative of gravity's moment and modal forces with respect to the Euler parameters.
+    fn add_gravity_tangent(&mut self, load: f64, state: &State, ws: &Workspace) {
+        let system = self.system;
+        let order = self.residual.len();
+        let gravity = system.gravity_m_per_s2 * load;
+        let deformed = system.deformed_gravity();
+        for (entry, motion) in system.bodies.iter().zip(&ws.bodies) {
+            let theta = euler_parameters(state, entry.first_q);
+            let map = rate_map(&theta);
+            let mut modal = vec![0.0; entry.frame.mode_count()];
+            let rows = |gravity: &Vector3<f64>, modal: &mut [f64]| {
+                let mut frame = [0.0; 6];
+                entry
+                    .frame
+                    .subtract_gravity(motion, gravity, deformed, &mut frame, modal);
+                Vector3::from_column_slice(&frame[3..])
+            };
+            let moment = rows(&gravity, &mut modal);
+            for parameter in 0..4 {
+                let along = Direction::new(3 + parameter, &theta);
+                let turned = motion.rotation * along.rotation.tr_mul(&gravity);
+                modal.fill(0.0);
+                let moment_change = rows(&turned, &mut modal);
+                let turning = map.tr_mul(&moment_change) + rate_map(&along.parameters).tr_mul(&moment);
+                let column = entry.first_q + 3 + parameter;
+                for (i, x) in turning.iter().chain(&modal).enumerate() {
+                    self.jacobian.values[(entry.first_q + 3 + i) * order + column] += x;
+                }
+            }
         }
     }
 
@@ -338,17 +372,17 @@ impl<'a> LooseNewton<'a> {
         bodies.dedup();
         for body in bodies {
             let entry = &system.bodies[body];
-            let map = rate_map(&euler_parameters(state, entry.first_q));
+            let theta = euler_parameters(state, entry.first_q);
             for local in 0..7 + entry.frame.mode_count() {
                 let column = entry.first_q + local;
-                let along = Direction::new(local, &map);
+                let along = Direction::new(local, &theta);
                 let moved: Vector3<f64> = ends
                     .iter()
                     .filter_map(|&(marker, sign)| Some((marker, sign, body_of(marker)?)))
                     .filter(|(_, _, on)| on.body == body)
                     .map(|(marker, sign, on)| {
-                        let inside = along.turn.cross(&ws.markers[marker].local_m) + along.strain(on);
-                        sign * (along.shift + ws.bodies[body].rotation * inside)
+                        let turned = along.rotation * ws.markers[marker].local_m;
+                        sign * (along.shift + turned + ws.bodies[body].rotation * along.strain(on))
                     })
                     .sum();
                 let stretch = line.dot(&moved);
@@ -361,12 +395,13 @@ impl<'a> LooseNewton<'a> {
                     let Some(on) = body_of(marker) else { continue };
                     let (out, at) = (&system.bodies[on.body], &ws.markers[marker]);
                     let rotation = &ws.bodies[on.body].rotation;
-                    let force = rotation.tr_mul(&(line * (sign * motion.force.force_n)));
+                    let pull = line * (sign * motion.force.force_n);
+                    let force = rotation.tr_mul(&pull);
                     let mut force_change = rotation.tr_mul(&(sign * change));
                     let mut moment_change = Vector3::zeros();
                     let mut turning = Vector4::zeros();
                     if on.body == body {
-                        force_change += force.cross(&along.turn);
+                        force_change += along.rotation.tr_mul(&pull);
                         moment_change = along.strain(on).cross(&force);
                         turning = rate_map(&along.parameters).tr_mul(&at.local_m.cross(&force));
                     }
@@ -398,24 +433,27 @@ fn euler_parameters(state: &State, first_q: usize) -> Vector4<f64> {
 struct Direction {
     shift: Vector3<f64>,
     parameters: Vector4<f64>,
-    /// Rotation in the body frame.
-    turn: Vector3<f64>,
+    /// Derivative of the rotation matrix, also along θ itself: unfinished iterations leave the unit sphere.
+    rotation: Matrix3<f64>,
     mode: Option<usize>,
 }
 
 impl Direction {
-    fn new(local: usize, map: &Matrix3x4<f64>) -> Self {
+    fn new(local: usize, theta: &Vector4<f64>) -> Self {
         let mut direction = Self {
             shift: Vector3::zeros(),
             parameters: Vector4::zeros(),
-            turn: Vector3::zeros(),
+            rotation: Matrix3::zeros(),
             mode: local.checked_sub(7),
         };
         if local < 3 {
             direction.shift[local] = 1.0;
         } else if local < 7 {
             direction.parameters[local - 3] = 1.0;
-            direction.turn = map.column(local - 3).into_owned();
+            // The rotation matrix is quadratic, so that a central difference is its derivative.
+            direction.rotation = 0.5
+                * (rotation_matrix(&(theta + direction.parameters))
+                    - rotation_matrix(&(theta - direction.parameters)));
         }
         direction
     }
