@@ -37,6 +37,7 @@ mod cholesky;
 pub mod scheduled;
 pub mod envelope;
 pub mod noise;
+mod simd;
 pub mod network;
 pub mod train;
 pub mod model;

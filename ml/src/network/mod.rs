@@ -35,6 +35,15 @@ impl Loss {
         }
     }
 
+    /// Derivative of [`Self::value`].
+    #[must_use]
+    pub fn slope(self, error: f32) -> f32 {
+        match self {
+            Self::Square => 2.0 * error,
+            Self::PseudoHuber => 2.0 * error / (1.0 + error * error).sqrt(),
+        }
+    }
+
     /// Of one error.
     #[must_use]
     pub fn value(self, error: f64) -> f64 {

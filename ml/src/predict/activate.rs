@@ -7,7 +7,7 @@
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
 
-use super::simd::Simd;
+use crate::simd::Simd;
 use hydroflex_openapi::model::Activation;
 
 /// Activates values in place; `values` holds whole vectors.

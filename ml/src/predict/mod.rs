@@ -9,7 +9,6 @@ mod activate;
 pub mod kernel;
 pub mod panel;
 mod scale;
-mod simd;
 pub mod skip;
 pub mod guard;
 pub mod sliding;
