@@ -38,6 +38,7 @@ pub mod scheduled;
 pub mod envelope;
 pub mod noise;
 mod simd;
+mod activate;
 pub mod network;
 pub mod train;
 pub mod model;

@@ -25,7 +25,7 @@
               load would double its cost: lengths are compared before the loops"
 )]
 
-use super::activate::activate;
+use crate::activate::activate;
 use crate::model::weights::LinearWeights;
 pub use crate::simd::{Level, level};
 use crate::simd::{Simd, dispatch};

@@ -15,6 +15,7 @@
 mod products;
 
 use super::prepare::{Part, Whitening};
+use crate::activate;
 use crate::network::{Loss, elementwise};
 use crate::simd::{Level, level};
 use hydroflex_openapi::model::DenseLayer;
@@ -447,7 +448,11 @@ impl Scratch {
                         .copy_from_slice(&head[stage].values()[..count * width]);
                     stage += 1;
                 }
-                elementwise::apply(activation, &mut stages[stage].values_mut()[..count * width]);
+                activate::apply(
+                    self.level,
+                    activation,
+                    &mut stages[stage].values_mut()[..count * width],
+                );
             }
         }
     }

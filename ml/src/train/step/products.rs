@@ -199,7 +199,7 @@ impl Multiply {
                     ($r:literal, $row:expr) => {
                         Self::tile::<S, $r, $p>(
                             left,
-                            places.as_ptr().add($row),
+                            &places[$row..],
                             count,
                             right.add(column),
                             width,
@@ -217,7 +217,7 @@ impl Multiply {
     #[inline(always)]
     unsafe fn tile<S: Simd, const R: usize, const P: usize>(
         left: *const f32,
-        places: *const usize,
+        places: &[usize],
         count: usize,
         mut right: *const f32,
         width: usize,
@@ -226,7 +226,13 @@ impl Multiply {
     ) {
         let mut rows = [left; R];
         for r in 0..R {
-            rows[r] = left.add(*places.add(r));
+            rows[r] = left.add(*places.get_unchecked(r));
+        }
+        // Windows stand anywhere: the processor does not foresee where the next ones begin.
+        for &place in places.iter().skip(R).take(R) {
+            for k in (0..count).step_by(LANES) {
+                prefetch(left.add(place + k));
+            }
         }
         let mut sums = [[S::splat(0.0); P]; R];
         for p in 0..P {
@@ -254,6 +260,19 @@ impl Multiply {
             }
         }
     }
+}
+
+/// Asks for the cache line of a value.
+#[inline(always)]
+fn prefetch(value: *const f32) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: a hint, without effect on anything but the cache.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T1>(value.cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
 }
 
 struct MultiplyTransposed;
