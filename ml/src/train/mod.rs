@@ -7,7 +7,9 @@
 
 pub mod prepare;
 pub mod adam;
+pub mod autodiff;
 pub mod checkpoint;
+pub mod comparison;
 pub mod step;
 
 use crate::least_squares::SpectrumError;
@@ -15,8 +17,9 @@ use crate::model::ModelError;
 use crate::network::init::epoch_order;
 use crate::runs::{Runs, RunsError};
 use crate::scheduled::NormalEquationsError;
-use crate::structure::StructureError;
+use crate::structure::{Form, Structure, StructureError};
 use crate::window::WindowError;
+use autodiff::Autodiff;
 use checkpoint::TrainState;
 use hydroflex_openapi::job::TrainingSpec;
 use hydroflex_openapi::model::{EpochRecord, ModelSummary, TrainingEnd};
@@ -177,6 +180,11 @@ pub fn train(
     checkpoint_dir: &Path,
     out_dir: &Path,
 ) -> Result<ModelSummary, TrainError> {
+    if Structure::is_comparison(&spec.structure) {
+        return Err(TrainError::Structure(StructureError::Comparison {
+            name: spec.structure.clone(),
+        }));
+    }
     let problem = Problem::new(data, spec)?;
     let outcome = fit(&problem, &data.dataset_sha256, progress, checkpoint_dir)?;
     let summary = crate::model::write::write_model(&problem, data, &outcome, out_dir)?;
@@ -284,10 +292,38 @@ fn intervals(fraction: f64) -> f64 {
     (fraction * VALIDATIONS + 1e-6).floor()
 }
 
+/// Who differentiates.
+enum Network {
+    Own(Box<Step>),
+    Burn(Autodiff),
+}
+
+impl Network {
+    fn gradient(
+        &mut self,
+        samples: Samples<'_>,
+        parameters: &[f32],
+        batch: &[u32],
+        gradient: &mut [f32],
+    ) -> f64 {
+        match self {
+            Self::Own(step) => step.gradient(samples, parameters, batch, gradient),
+            Self::Burn(network) => network.gradient(samples, parameters, batch, gradient),
+        }
+    }
+
+    fn loss(&mut self, samples: Samples<'_>, parameters: &[f32]) -> f64 {
+        match self {
+            Self::Own(step) => step.loss(samples, parameters),
+            Self::Burn(network) => network.loss(samples, parameters),
+        }
+    }
+}
+
 /// The problem with what every step needs.
 struct Trainer<'a> {
     problem: &'a Problem,
-    step: Step,
+    network: Network,
     train_rows: Vec<u32>,
     validation_rows: Vec<u32>,
     gradient: Vec<f32>,
@@ -297,13 +333,16 @@ impl<'a> Trainer<'a> {
     fn new(problem: &'a Problem) -> Self {
         Self {
             problem,
-            step: Step::new(
-                &problem.layers,
-                &problem.whitening,
-                problem.steps * problem.train.series.width,
-                problem.recipe.batch,
-                problem.loss,
-            ),
+            network: match problem.structure.form {
+                Form::Dense => Network::Own(Box::new(Step::new(
+                    &problem.layers,
+                    &problem.whitening,
+                    problem.steps * problem.train.series.width,
+                    problem.recipe.batch,
+                    problem.loss,
+                ))),
+                _ => Network::Burn(comparison::autodiff(problem)),
+            },
             train_rows: step::first_rows(&problem.train),
             validation_rows: step::first_rows(&problem.validation),
             gradient: vec![0.0; problem.parameters.len()],
@@ -401,7 +440,7 @@ fn epoch(
         }
         let rate = limits.rate(fraction);
         let loss = trainer
-            .step
+            .network
             .gradient(samples, &state.parameters, batch, &mut trainer.gradient);
         if !loss.is_finite() || loss > DIVERGENCE {
             return Err(TrainError::Diverged {
@@ -429,7 +468,7 @@ fn validate(trainer: &mut Trainer<'_>, state: &mut TrainState, train_loss: f64, 
         part: &trainer.problem.validation,
         first_rows: &trainer.validation_rows,
     };
-    let loss = trainer.step.loss(samples, &state.parameters);
+    let loss = trainer.network.loss(samples, &state.parameters);
     state.counters.validated_at = fraction;
     state.counters.history.push(EpochRecord {
         epoch: state.counters.epoch,

@@ -41,13 +41,19 @@ enum First {
     /// The window as it is.
     Window,
     /// The window as it is; whitening is part of the first layer. `projection`: a row per component.
-    Folded { projection: Rows, offset: Vec<f32> },
+    Folded {
+        projection: Rows,
+        places: Vec<usize>,
+        offset: Vec<f32>,
+    },
     /// The whitened window. `projection`: a row per window value.
     Projected { projection: Rows, offset: Rows },
 }
 
 struct Network {
     level: Level,
+    /// As many as the widest layer has outputs.
+    zeros: Rows,
     first: First,
     layers: Vec<Layer>,
 }
@@ -78,7 +84,6 @@ struct Scratch {
     values: Vec<Vec<Rows>>,
     /// Derivatives of the loss with respect to the outputs of a layer, and of the one before it.
     delta: [Rows; 2],
-    zeros: Rows,
     /// Per layer, laid out as its weights and bias.
     gradients: Vec<(Rows, Rows)>,
     loss: f64,
@@ -156,7 +161,7 @@ impl Step {
             );
             a.add(b);
         }
-        network.give(&mut a.gradients, gradient);
+        self.network.give(&a.gradients, gradient);
         a.loss / f64::from(divisor)
     }
 
@@ -186,8 +191,10 @@ impl Network {
         let first = if components == 0 {
             First::Window
         } else if folded < projected {
+            let projection = Rows::of(&whitening.projection, values);
             First::Folded {
-                projection: Rows::of(&whitening.projection, values),
+                places: projection.places(),
+                projection,
                 offset: whitening.offset.clone(),
             }
         } else {
@@ -206,6 +213,7 @@ impl Network {
                 offset: Rows::of(&whitening.offset, components),
             }
         };
+        let widest = layers.iter().map(|l| l.inputs.max(l.outputs)).max().unwrap_or(0);
         let layers = layers
             .iter()
             .enumerate()
@@ -222,7 +230,12 @@ impl Network {
                 }
             })
             .collect();
-        Self { level, first, layers }
+        Self {
+            level,
+            zeros: Rows::new(1, widest),
+            first,
+            layers,
+        }
     }
 
     /// Turns the parameters.
@@ -252,10 +265,14 @@ impl Network {
             }
         }
         assert!(rest.is_empty(), "{} parameters too many", rest.len());
-        if let First::Folded { projection, offset } = &self.first {
+        if let First::Folded {
+            projection,
+            places,
+            offset,
+        } = &self.first
+        {
             let layer = &mut self.layers[0];
             let (level, width) = (self.level, layer.bias.width());
-            let places = projection.places();
             let unfolded = layer.unfolded.values();
             // Rows of the product do not know of each other: two threads, the same bits.
             let values = layer.forward.values().len() / width;
@@ -267,7 +284,7 @@ impl Network {
                 multiply_transposed(
                     level,
                     &projection.values()[first..],
-                    &places,
+                    places,
                     count,
                     unfolded,
                     width,
@@ -284,57 +301,69 @@ impl Network {
         }
     }
 
-    /// Turns gradients into one that stands as the parameters do.
-    fn give(&self, gradients: &mut [(Rows, Rows)], gradient: &mut [f32]) {
+    /// Turns gradients into one that stands as the parameters do. The unfolded weights make room for their gradient.
+    fn give(&mut self, gradients: &[(Rows, Rows)], gradient: &mut [f32]) {
         let mut rest = gradient;
-        for (position, (layer, (weights, bias))) in self.layers.iter().zip(gradients).enumerate() {
+        for (position, (layer, (weights, bias))) in self.layers.iter_mut().zip(gradients).enumerate() {
             let (inputs, outputs) = (layer.shape.inputs, layer.shape.outputs);
             let (weight_out, tail) = rest.split_at_mut(outputs * inputs);
             let (bias_out, tail) = tail.split_at_mut(outputs);
             rest = tail;
             bias_out.copy_from_slice(&bias.values()[..outputs]);
             let width = bias.width();
-            match &self.first {
-                First::Folded { projection, offset } if position == 0 => {
-                    let mut unfolded = Rows::new(inputs, outputs);
-                    self.unfold(projection, offset, weights, bias, &mut unfolded);
-                    transpose(unfolded.values(), width, inputs, outputs, weight_out, inputs);
-                }
-                _ => transpose(weights.values(), width, inputs, outputs, weight_out, inputs),
-            }
+            let weights = if position == 0 && matches!(self.first, First::Folded { .. }) {
+                unfold(
+                    self.level,
+                    &self.first,
+                    self.zeros.values(),
+                    weights,
+                    bias,
+                    &mut layer.unfolded,
+                );
+                &layer.unfolded
+            } else {
+                weights
+            };
+            transpose(weights.values(), width, inputs, outputs, weight_out, inputs);
         }
     }
+}
 
-    /// `out = P · folded + o · biasᵀ`.
-    fn unfold(&self, projection: &Rows, offset: &[f32], folded: &Rows, bias: &Rows, out: &mut Rows) {
-        let (level, width) = (self.level, folded.width());
-        let places = projection.places();
-        let values = folded.values().len() / width;
-        let cut = places.len() / 2;
-        let zeros = vec![0.0; width];
-        let (head, tail) = out.values_mut().split_at_mut(cut * width);
-        let unfold = |places: &[usize], offset: &[f32], out: &mut [f32]| {
-            multiply(
-                level,
-                projection.values(),
-                places,
-                values,
-                folded.values(),
-                width,
-                &zeros,
-                out,
-            );
-            for (row, o) in out.chunks_mut(width).zip(offset) {
-                for (g, b) in row.iter_mut().zip(bias.values()) {
-                    *g += o * b;
-                }
-            }
-        };
-        both(
-            || unfold(&places[..cut], &offset[..cut], head),
-            || unfold(&places[cut..], &offset[cut..], tail),
+/// `out = P · folded + o · biasᵀ`.
+fn unfold(level: Level, first: &First, zeros: &[f32], folded: &Rows, bias: &Rows, out: &mut Rows) {
+    let First::Folded {
+        projection,
+        places,
+        offset,
+    } = first
+    else {
+        return;
+    };
+    let width = folded.width();
+    let values = folded.values().len() / width;
+    let cut = places.len() / 2;
+    let (head, tail) = out.values_mut().split_at_mut(cut * width);
+    let unfold = |places: &[usize], offset: &[f32], out: &mut [f32]| {
+        multiply(
+            level,
+            projection.values(),
+            places,
+            values,
+            folded.values(),
+            width,
+            zeros,
+            out,
         );
-    }
+        for (row, o) in out.chunks_mut(width).zip(offset) {
+            for (g, b) in row.iter_mut().zip(bias.values()) {
+                *g += o * b;
+            }
+        }
+    };
+    both(
+        || unfold(&places[..cut], &offset[..cut], head),
+        || unfold(&places[cut..], &offset[cut..], tail),
+    );
 }
 
 impl Scratch {
@@ -359,7 +388,6 @@ impl Scratch {
                 })
                 .collect(),
             delta: [Rows::new(BLOCK, widest), Rows::new(BLOCK, widest)],
-            zeros: Rows::new(1, widest),
             gradients: network
                 .layers
                 .iter()
@@ -536,7 +564,7 @@ impl Scratch {
                     layer.shape.outputs,
                     layer.backward.values(),
                     layer.backward.width(),
-                    self.zeros.values(),
+                    network.zeros.values(),
                     next.values_mut(),
                 );
                 std::mem::swap(delta, next);
@@ -597,7 +625,7 @@ mod tests {
     use crate::least_squares::TargetRows;
     use crate::network::init::initial_parameters;
     use crate::network::{NetworkTensors, batch_tensor};
-    use crate::structure::Structure;
+    use crate::structure::{Form, Structure};
     use crate::window::{Series, Windows};
     use burn::tensor::{Device, Tensor};
     use hydroflex_openapi::job::WindowCut;
@@ -674,7 +702,7 @@ mod tests {
         }
         let mut gradient = vec![0.0; parameters.len()];
         let inputs: Tensor<2> = batch_tensor(inputs, batch.len(), &device);
-        let value = NetworkTensors::new(layers, parameters, &device).loss_and_gradient(
+        let value = NetworkTensors::new(Form::Dense, layers, parameters, &device).loss_and_gradient(
             inputs,
             batch_tensor(wanted, batch.len(), &device),
             loss,
