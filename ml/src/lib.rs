@@ -37,6 +37,8 @@ mod cholesky;
 pub mod scheduled;
 pub mod envelope;
 pub mod noise;
+mod simd;
+mod activate;
 pub mod network;
 pub mod train;
 pub mod model;

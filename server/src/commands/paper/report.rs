@@ -34,7 +34,7 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
             text.push_str(&row(group, t));
         }
         for group in groups(cells) {
-            if first_of_its_sensors(cells, group) {
+            if first_with_baselines(cells, group) {
                 text.push_str(&baselines(&group[0], t));
             }
         }
@@ -68,6 +68,9 @@ fn intervals(text: &mut String, cells: &[Cell]) {
     for group in groups(cells) {
         let head = &group[0];
         for (t, target) in head.calm.targets.iter().enumerate() {
+            if target.coverage.is_none() {
+                continue;
+            }
             let (factor, unit) = display(target);
             let part = |get: &dyn Fn(&Cell) -> Option<f64>| {
                 let values: Vec<f64> = group.iter().filter_map(get).collect();
@@ -226,11 +229,11 @@ fn groups(cells: &[Cell]) -> impl Iterator<Item = &[Cell]> {
     cells.chunk_by(same)
 }
 
-fn first_of_its_sensors(cells: &[Cell], group: &[Cell]) -> bool {
+fn first_with_baselines(cells: &[Cell], group: &[Cell]) -> bool {
     let head = &group[0];
     cells
         .iter()
-        .find(|c| same_data(c, head))
+        .find(|c| same_data(c, head) && !c.cycle.baselines.is_empty())
         .is_some_and(|first| first.structure == head.structure)
 }
 
