@@ -20,7 +20,7 @@ use hydroflex_ml::structure::Structure;
 use hydroflex_ml::train::comparison::Comparison;
 use hydroflex_ml::train::{Progress, train_dataset};
 use hydroflex_openapi::job::{
-    Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowRule,
+    Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowCut, WindowRule,
 };
 use hydroflex_openapi::model::{EvaluationReport, FaultRate};
 use hydroflex_sim::machine::Machine;
@@ -69,6 +69,10 @@ pub struct Args {
     /// Sensor sets, separated by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "all,usp,us")]
     pub sensors: Vec<SensorSet>,
+    /// How the paper's letters are trained, separated by commas: `ours`, `published` (disjoint windows, learning rate
+    /// 1e-4, a batch of an eighth of the runs, at most 1,000 epochs); other structures always as we do
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "ours")]
+    pub recipes: Vec<Recipe>,
     /// Structures, separated by commas: `best`, L, RLR, TLTLT, TLSLTLSLT, ELE, …; for comparison RNN, LSTM, CNN
     #[arg(long, value_delimiter = ',', default_value = "best")]
     pub structures: Vec<String>,
@@ -122,6 +126,31 @@ impl NoiseChoice {
         match self {
             Self::None => None,
             Self::Crane => Some(NoiseSpec::Level(NoiseLevel::Crane)),
+        }
+    }
+}
+
+/// How a network is trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Recipe {
+    /// All overlapping windows, a learning rate that falls to zero
+    #[default]
+    Ours,
+    /// As in the published scripts
+    Published,
+}
+
+impl Recipe {
+    /// Whether a structure is trained in this way: the published way belongs to the paper's letters.
+    fn applies_to(self, structure: &str) -> bool {
+        self == Self::Ours || !(structure == "best" || Structure::is_comparison(structure))
+    }
+
+    fn windows(self) -> WindowCut {
+        match self {
+            Self::Ours => WindowCut::Overlapping,
+            Self::Published => WindowCut::Disjoint,
         }
     }
 }
@@ -207,6 +236,8 @@ struct Cell {
     trained: Payload,
     sensors: SensorSet,
     structure: String,
+    #[serde(default)]
+    recipe: Recipe,
     noise: NoiseChoice,
     seed: u64,
     /// As asked for.
@@ -304,14 +335,15 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     for trained in &sets {
         for &sensors in &args.sensors {
             for structure in &args.structures {
-                for &noise in &args.noise {
+                let recipes = args.recipes.iter().filter(|recipe| recipe.applies_to(structure));
+                for (&recipe, &noise) in recipes.flat_map(|r| args.noise.iter().map(move |n| (r, n))) {
                     for seed in 0..args.seeds {
                         let study = Study {
                             args: &args,
                             sets: &sets,
                             trained,
                         };
-                        cells.extend(study.cells(sensors, structure, noise, seed)?);
+                        cells.extend(study.cells(sensors, structure, recipe, noise, seed)?);
                     }
                 }
             }
@@ -326,10 +358,17 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     let text = report::markdown(&args, &simulator.machine().file().name, &cells);
     let path = args.out.join("report.md");
     std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
+    let picture = args.out.join("report.svg");
+    std::fs::write(&picture, report::picture(&cells).to_svg())
+        .with_context(|| format!("cannot write {}", picture.display()))?;
     if args.json {
         return print_json(&cells);
     }
-    print_line(format_args!("{text}\nreport: {}", path.display()))
+    print_line(format_args!(
+        "{text}\nreport: {}, picture: {}",
+        path.display(),
+        picture.display()
+    ))
 }
 
 /// What `--short` stands for; whatever was given differently stays.
@@ -482,6 +521,7 @@ impl Study<'_> {
         &self,
         sensors: SensorSet,
         structure: &str,
+        recipe: Recipe,
         noise: NoiseChoice,
         seed: u64,
     ) -> anyhow::Result<Vec<Cell>> {
@@ -501,13 +541,20 @@ impl Study<'_> {
                 window_s: steps as f64 * SAMPLE_S,
             },
             seed,
-            epochs: self.args.epochs,
+            // The published length belongs to the published way.
+            epochs: self.args.epochs.filter(|_| recipe == Recipe::Ours),
             time_limit_s: self.args.time_limit_s,
             noise: noise.spec(),
+            windows: recipe.windows(),
             ..TrainingSpec::default()
         };
         let noisy = if noise == NoiseChoice::Crane { "-crane" } else { "" };
-        let name = format!("{}-{structure}{noisy}-{seed}", sensors.name());
+        let published = if recipe == Recipe::Published {
+            "-published"
+        } else {
+            ""
+        };
+        let name = format!("{}-{structure}{published}{noisy}-{seed}", sensors.name());
         let path = folder.join(format!("{name}.json"));
         let evaluated: Vec<(f64, &Dataset)> = self
             .sets
@@ -564,6 +611,7 @@ impl Study<'_> {
                 trained: *payload,
                 sensors,
                 structure: structure.to_owned(),
+                recipe,
                 noise,
                 seed,
                 spec: spec.clone(),
@@ -631,6 +679,7 @@ impl Study<'_> {
                 trained: *payload,
                 sensors,
                 structure: spec.structure.clone(),
+                recipe: Recipe::Ours,
                 noise,
                 seed: spec.seed,
                 spec: spec.clone(),
