@@ -368,10 +368,11 @@ fn the_same_seed_gives_the_same_bytes_even_when_killed_and_resumed() {
 #[test]
 fn networks_for_comparison_learn_and_are_judged_as_the_others() {
     let folder = Folder::new("comparison");
-    for (structure, least_r2) in [("RNN", 0.9), ("LSTM", 0.9), ("CNN", 0.9)] {
+    for structure in ["RNN", "LSTM", "CNN"] {
         let spec = TrainingSpec {
             width: Some(16),
-            ..spec(structure, 20)
+            learning_rate: Some(1e-2),
+            ..spec(structure, 40)
         };
         let train = || Comparison::train(&data(), &spec, &mut go_on, &folder.0.join("checkpoint")).unwrap();
         let network = train();
@@ -382,11 +383,7 @@ fn networks_for_comparison_learn_and_are_judged_as_the_others() {
             5 * 101,
             "120 samples have 101 windows of 20"
         );
-        assert!(
-            report.targets[0].r2 > least_r2,
-            "{structure}: {:?}",
-            report.targets[0]
-        );
+        assert!(report.targets[0].r2 > 0.9, "{structure}: {:?}", report.targets[0]);
         assert_eq!(
             report,
             train().evaluate(&unseen, "").unwrap(),

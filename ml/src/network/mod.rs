@@ -1,4 +1,4 @@
-//! Layers on burn tensors: what the training loop differentiates.
+//! Networks on burn tensors: what burn differentiates, and what the training step of processors is checked against.
 //!
 //! Parameters stand in one flat vector, layer by layer: weight (outputs × inputs, row-major, as
 //! PyTorch has it), then bias. The optimiser, the checkpoint and the model folder see only that.
@@ -290,9 +290,9 @@ mod tests {
                 affine(&mut rest, &hidden, 4 * WIDTH),
             );
             let gate = |g: usize, i: usize| a[g * WIDTH + i] + b[g * WIDTH + i];
-            for i in 0..WIDTH {
-                cell[i] = sigmoid(gate(1, i)) * cell[i] + sigmoid(gate(0, i)) * gate(2, i).tanh();
-                hidden[i] = sigmoid(gate(3, i)) * cell[i].tanh();
+            for (i, (cell, hidden)) in cell.iter_mut().zip(&mut hidden).enumerate() {
+                *cell = sigmoid(gate(1, i)) * *cell + sigmoid(gate(0, i)) * gate(2, i).tanh();
+                *hidden = sigmoid(gate(3, i)) * cell.tanh();
             }
         }
         affine(&mut rest, &hidden, 1)[0]

@@ -68,6 +68,9 @@ impl Autodiff {
     }
 
     /// Outputs for all windows of `samples`, window by window.
+    ///
+    /// # Panics
+    /// When `parameters` has another length than the layers need.
     #[must_use]
     pub fn outputs(&self, samples: Samples<'_>, parameters: &[f32]) -> Vec<f32> {
         let device = Device::flex();

@@ -556,18 +556,7 @@ impl Study<'_> {
         };
         let name = format!("{}-{structure}{published}{noisy}-{seed}", sensors.name());
         let path = folder.join(format!("{name}.json"));
-        let evaluated: Vec<(f64, &Dataset)> = self
-            .sets
-            .iter()
-            .filter_map(|set| match (set.payload, &set.evaluation) {
-                (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
-                _ => None,
-            })
-            .filter(|(kg, _)| match payload {
-                Payload::Fixed(own) => own.to_bits() == kg.to_bits(),
-                Payload::Range { .. } => true,
-            })
-            .collect();
+        let evaluated = self.evaluated();
         if Structure::is_comparison(structure) {
             let asked = Asked {
                 sensors,
@@ -637,6 +626,22 @@ impl Study<'_> {
         std::fs::write(&path, serde_json::to_vec_pretty(&cells)?)
             .with_context(|| format!("cannot write {}", path.display()))?;
         Ok(cells)
+    }
+
+    /// The evaluation sets of the payloads that the trained network is for.
+    fn evaluated(&self) -> Vec<(f64, &Dataset)> {
+        let payload = self.trained.payload;
+        self.sets
+            .iter()
+            .filter_map(|set| match (set.payload, &set.evaluation) {
+                (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
+                _ => None,
+            })
+            .filter(|(kg, _)| match payload {
+                Payload::Fixed(own) => own.to_bits() == kg.to_bits(),
+                Payload::Range { .. } => true,
+            })
+            .collect()
     }
 
     /// The same for a network for comparison, which has no folder, intervals or envelope.

@@ -4,12 +4,12 @@
 //! windows (where they stand) → whitened → layer → … → layer → error → gradients of weights and biases
 //! ```
 //!
-//! A batch is cut into two halves for two threads, a half into blocks of [`BLOCK`] windows, which go forward and
+//! A batch is cut into two halves for two threads, a half into blocks of 96 windows, which go forward and
 //! backward through the whole network while they are in the second-level cache. Halves are fixed and added in order:
 //! the bits do not depend on the number of threads.
 //!
 //! Whitening, `z = P x + o`, is linear, as is what the first layer does with z: `W z + b = (W P) x + (W o + b)`. Where it
-//! costs less, the product W P is made once per batch and the windows stay as they are ([`First::Folded`]); the gradient
+//! costs less, the product W P is made once per batch and the windows stay as they are; the gradient
 //! with respect to W is then the one with respect to W P, times Pᵀ, plus that of the bias, times oᵀ.
 
 mod products;
@@ -99,6 +99,9 @@ pub struct Samples<'a> {
 }
 
 /// First row of each window of `part`, to be kept for [`Samples`].
+///
+/// # Panics
+/// With 2³² rows or more.
 #[must_use]
 pub fn first_rows(part: &Part) -> Vec<u32> {
     let row = |index| u32::try_from(part.windows.first_row(index)).expect("fewer than 2³² rows");
@@ -508,10 +511,11 @@ impl Scratch {
         {
             let wanted = (first as usize + part.windows.steps - 1) * targets;
             delta.fill(0.0);
-            for t in 0..targets {
-                let error = row[t] - part.wanted[wanted + t];
+            let wanted = &part.wanted[wanted..wanted + targets];
+            for ((slope, output), wanted) in delta.iter_mut().zip(row).zip(wanted) {
+                let error = output - wanted;
                 sum += loss.value(f64::from(error));
-                delta[t] = loss.slope(error) / divisor;
+                *slope = loss.slope(error) / divisor;
             }
         }
         sum
