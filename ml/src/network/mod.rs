@@ -330,14 +330,15 @@ mod tests {
         affine(&mut rest, &flat, 1)[0]
     }
 
+    type Definition = fn(&[f32], &[f64]) -> f64;
+
     #[test]
     fn networks_for_comparison_follow_their_definitions() {
         let device = Device::flex();
         let windows: Vec<f32> = (0..3 * STEPS * CHANNELS)
             .map(|i| (i as f32 * 0.7).sin())
             .collect();
-        let definitions: [(&str, fn(&[f32], &[f64]) -> f64); 3] =
-            [("RNN", rnn), ("LSTM", lstm), ("CNN", cnn)];
+        let definitions: [(&str, Definition); 3] = [("RNN", rnn), ("LSTM", lstm), ("CNN", cnn)];
         for (name, definition) in definitions {
             let structure = Structure::parse_any(name, STEPS, Some(WIDTH)).unwrap();
             let layers = structure.layers(STEPS * CHANNELS, 1);
