@@ -8,7 +8,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=${HYDROFLEX_HEAVY_VENV:-target/heavy-venv}
 if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
-"$venv/bin/pip" install --quiet --disable-pip-version-check torch numpy pyarrow safetensors
+"$venv/bin/pip" install --quiet --disable-pip-version-check torch numpy pyarrow safetensors matplotlib
 if [ -z "${HYDROFLEX_BIN:-}" ]; then
     cargo build --release
     export HYDROFLEX_BIN=$PWD/target/release/hydroflex

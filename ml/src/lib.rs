@@ -13,7 +13,7 @@
 //! * [`least_squares`]: the best linear map of a window, a baseline; [`scheduled`]: the same with
 //!   coefficients that follow the machine's pose, the skip connection of our network.
 //! * [`envelope`]: what tells a window unlike the training's; [`noise`]: sensor noise to train and judge with.
-//! * [`train`]: the training loop on burn tensors, with checkpoints.
+//! * [`train`]: the training loop with checkpoints; a step of our own on processors, burn for the networks for comparison.
 //! * [`model`]: the model folder; [`predict`]: estimates without the tensor framework.
 //! * [`evaluate`], [`plot`]: errors in physical units, and the picture of them.
 
@@ -37,6 +37,8 @@ mod cholesky;
 pub mod scheduled;
 pub mod envelope;
 pub mod noise;
+mod simd;
+mod activate;
 pub mod network;
 pub mod train;
 pub mod model;

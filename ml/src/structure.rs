@@ -10,9 +10,38 @@ pub struct Structure {
     /// Whether the least-squares map of the window (coefficients following the pose) is added, and
     /// the network learns the rest.
     pub linear_skip: bool,
+    /// How its layers are put together.
+    pub form: Form,
     /// Widths of the hidden layers and what follows each of them.
     hidden: Vec<(usize, Vec<Activation>)>,
 }
+
+/// How layers are put together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// One after the other: what is exported and served.
+    Dense,
+    /// Elman's recurrent network over the samples of a window; for comparison.
+    Rnn {
+        /// Samples in a window.
+        steps: usize,
+    },
+    /// Long short-term memory over the samples of a window; for comparison.
+    Lstm {
+        /// Samples in a window.
+        steps: usize,
+    },
+    /// Two convolutions over time, each halving it, and a linear layer; for comparison.
+    Cnn {
+        /// Samples in a window.
+        steps: usize,
+    },
+}
+
+/// Samples that a convolution sees.
+pub(crate) const KERNEL: usize = 5;
+/// Hidden values of the recurrent networks, and channels of the second convolution.
+const COMPARISON_WIDTH: usize = 64;
 
 /// Widths of our own network's hidden layers; chosen by trial, see the model notes.
 const BEST_WIDTHS: [usize; 3] = [256, 256, 128];
@@ -30,6 +59,15 @@ pub enum StructureError {
         name: String,
         /// Letter.
         letter: char,
+    },
+    /// Not to be exported.
+    #[error(
+        "structure {name:?} is there for comparison, in `hydroflex reproduce-paper --structures {name}`: it is neither \
+         exported nor served; give \"best\", or letters such as RLR"
+    )]
+    Comparison {
+        /// Structure.
+        name: String,
     },
     /// No letter.
     #[error("the structure is empty; give \"best\", or letters such as RLR")]
@@ -56,6 +94,11 @@ impl Structure {
         if width == Some(0) {
             return Err(StructureError::NoWidth);
         }
+        if Self::is_comparison(name) {
+            return Err(StructureError::Comparison {
+                name: name.to_owned(),
+            });
+        }
         if name == "best" {
             let widest = width.unwrap_or(BEST_WIDTHS[0]);
             let hidden = BEST_WIDTHS
@@ -65,6 +108,7 @@ impl Structure {
             return Ok(Self {
                 name: name.to_owned(),
                 linear_skip: true,
+                form: Form::Dense,
                 hidden,
             });
         }
@@ -94,14 +138,74 @@ impl Structure {
         Ok(Self {
             name: name.to_owned(),
             linear_skip: false,
+            form: Form::Dense,
             hidden,
         })
+    }
+
+    /// Whether `name` is that of a network for comparison: RNN, LSTM or CNN.
+    #[must_use]
+    pub fn is_comparison(name: &str) -> bool {
+        matches!(name, "RNN" | "LSTM" | "CNN")
+    }
+
+    /// As [`Self::parse`], networks for comparison included; their width is 64 unless given.
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn parse_any(name: &str, steps: usize, width: Option<usize>) -> Result<Self, StructureError> {
+        if width == Some(0) {
+            return Err(StructureError::NoWidth);
+        }
+        let form = match name {
+            "RNN" => Form::Rnn { steps },
+            "LSTM" => Form::Lstm { steps },
+            "CNN" => Form::Cnn { steps },
+            _ => return Self::parse(name, steps, width),
+        };
+        Ok(Self {
+            name: name.to_owned(),
+            linear_skip: false,
+            form,
+            hidden: vec![(width.unwrap_or(COMPARISON_WIDTH), Vec::new())],
+        })
+    }
+
+    /// The linear maps of a network for comparison, for `inputs` window values.
+    fn comparison_layers(&self, inputs: usize, targets: usize) -> Vec<DenseLayer> {
+        let width = self.hidden[0].0;
+        let shapes = match self.form {
+            Form::Dense => return Vec::new(),
+            Form::Rnn { steps } => [(inputs / steps, width), (width, width), (width, targets)],
+            // Gates stand side by side: in, forget, candidate, out.
+            Form::Lstm { steps } => [(inputs / steps, 4 * width), (width, 4 * width), (width, targets)],
+            Form::Cnn { steps } => {
+                let (half, left) = (width.div_ceil(2), steps.div_ceil(2).div_ceil(2));
+                [
+                    (KERNEL * inputs / steps, half),
+                    (KERNEL * half, width),
+                    (width * left, targets),
+                ]
+            }
+        };
+        let named = shapes.into_iter().zip(["input", "hidden", "output"]);
+        named
+            .map(|((inputs, outputs), name)| DenseLayer {
+                name: name.to_owned(),
+                inputs,
+                outputs,
+                activations: Vec::new(),
+            })
+            .collect()
     }
 
     /// Layers for a number of window values and targets. Names count linear maps and activations
     /// alike, as in a PyTorch `Sequential`.
     #[must_use]
     pub fn layers(&self, inputs: usize, targets: usize) -> Vec<DenseLayer> {
+        if self.form != Form::Dense {
+            return self.comparison_layers(inputs, targets);
+        }
         let mut layers = Vec::with_capacity(self.hidden.len() + 1);
         let mut position = 0;
         let mut width = inputs;

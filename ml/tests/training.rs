@@ -9,6 +9,7 @@ use hydroflex_ml::evaluate;
 use hydroflex_ml::model::Model;
 use hydroflex_ml::predict::Predictor;
 use hydroflex_ml::runs::{RunSamples, Runs};
+use hydroflex_ml::train::comparison::Comparison;
 use hydroflex_ml::train::prepare::TrainingData;
 use hydroflex_ml::train::{Progress, TrainError, train};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
@@ -365,6 +366,33 @@ fn the_same_seed_gives_the_same_bytes_even_when_killed_and_resumed() {
 }
 
 #[test]
+fn networks_for_comparison_learn_and_are_judged_as_the_others() {
+    let folder = Folder::new("comparison");
+    for structure in ["RNN", "LSTM", "CNN"] {
+        let spec = TrainingSpec {
+            width: Some(16),
+            learning_rate: Some(1e-2),
+            ..spec(structure, 40)
+        };
+        let train = || Comparison::train(&data(), &spec, &mut go_on, &folder.0.join("checkpoint")).unwrap();
+        let network = train();
+        let unseen = oscillators(5, 1000);
+        let report = network.evaluate(&unseen, "").unwrap();
+        assert_eq!(
+            report.targets[0].samples,
+            5 * 101,
+            "120 samples have 101 windows of 20"
+        );
+        assert!(report.targets[0].r2 > 0.9, "{structure}: {:?}", report.targets[0]);
+        assert_eq!(
+            report,
+            train().evaluate(&unseen, "").unwrap(),
+            "{structure}: same seed, same errors"
+        );
+    }
+}
+
+#[test]
 fn impossible_trainings_are_refused_with_the_reason() {
     let folder = Folder::new("refused");
     let message = |data: &TrainingData, spec: &TrainingSpec| {
@@ -394,6 +422,7 @@ fn impossible_trainings_are_refused_with_the_reason() {
     };
     assert!(message(&data(), &wild).contains("diverged"));
     assert!(message(&data(), &spec("RXR", 1)).contains("'X'"));
+    assert!(message(&data(), &spec("LSTM", 1)).contains("neither exported nor served"));
 }
 
 #[test]

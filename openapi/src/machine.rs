@@ -47,13 +47,41 @@ pub struct MachineFile {
 }
 
 /// Switches between the better physics (default) and conventions of published models.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Conventions {
     /// Which centre of mass enters the gravity moment of a flexible body.
     pub gravity_moment: GravityMoment,
     /// How a marker's angular velocity combines rigid and modal rotation.
     pub marker_rotation: MarkerRotation,
+    /// Where the static start of the fixed-step schemes ends; absent: at rest to rounding.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub statics: Option<LooseStatics>,
+}
+
+/// A static start that ends where Exudyn's static solver ends with the same settings: loads grow in equal steps,
+/// each ends when the norm of the residual falls below a part of what it was at the step's beginning.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LooseStatics {
+    /// Steps in which gravity grows to its whole, at least 1.
+    pub load_steps: u32,
+    /// Residual at which a step ends, relative to the residual at its beginning.
+    pub relative_tolerance: f64,
+    /// A body welded to the ground that carries everything the machine file attaches to `ground`. It never moves, but
+    /// its weight and the forces on it count in the norm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ground_body: Option<GroundBody>,
+}
+
+/// The body behind `ground` in a published model, welded at the global origin.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GroundBody {
+    /// Mass.
+    pub mass_kg: f64,
+    /// Centre of mass, global.
+    pub centre_of_mass_m: [f64; 3],
 }
 
 /// Gravity moment of a flexible body (theory note §3.5).

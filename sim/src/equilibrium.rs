@@ -1,11 +1,12 @@
 //! Consistent start: pose, modal coordinates and chamber pressures (theory note §9).
 
-use hydroflex_openapi::machine::{BodySpec, JointKind, MachineFile};
+use hydroflex_openapi::machine::{BodySpec, JointKind, LooseStatics, MachineFile};
 use nalgebra::{DMatrix, DVector, Matrix3};
 
 use crate::body::marker::Marker;
 use crate::body::rotation::euler_parameters_about_z;
 use crate::integrate::{Increment, add_increment, normalise};
+use crate::loose_statics::LooseNewton;
 use crate::system::{Coefficients, CylinderRows, Level, Oil, State, System, Workspace};
 
 /// Iterations of the loop closure and of the static solution.
@@ -43,6 +44,18 @@ pub enum EquilibriumError {
         /// Last increment, m, rad or modal coordinate.
         increment: f64,
     },
+    /// The loosely converged start that the machine asks for was not reached.
+    #[error(
+        "no static start as `conventions.statics` asks for it: residual {residual:e} after {iterations} iterations of load step {load_step}"
+    )]
+    LooseNotConverged {
+        /// Load step, from 1.
+        load_step: u32,
+        /// Iterations in it.
+        iterations: usize,
+        /// Norm of the last residual, N and N m.
+        residual: f64,
+    },
 }
 
 /// A machine at rest.
@@ -76,10 +89,36 @@ pub fn equilibrium(
     angles_rad: &[f64],
     ws: &mut Workspace,
 ) -> Result<Equilibrium, EquilibriumError> {
+    settle(system, file, angles_rad, None, ws)
+}
+
+/// Where the fixed-step schemes start: the equilibrium, or where `conventions.statics` stops short of it.
+///
+/// # Errors
+/// As [`equilibrium`].
+pub(crate) fn fixed_step_start(
+    system: &System,
+    file: &MachineFile,
+    angles_rad: &[f64],
+    ws: &mut Workspace,
+) -> Result<Equilibrium, EquilibriumError> {
+    settle(system, file, angles_rad, system.conventions.statics, ws)
+}
+
+fn settle(
+    system: &System,
+    file: &MachineFile,
+    angles_rad: &[f64],
+    loose: Option<LooseStatics>,
+    ws: &mut Workspace,
+) -> Result<Equilibrium, EquilibriumError> {
     let mut state = assemble(system, file, angles_rad, ws)?;
     system.evaluate_motion(&state, ws);
     let locked: Vec<f64> = ws.cylinders.iter().map(|c| c.length_m).collect();
-    let iterations = relax(system, &locked, &mut state, ws)?;
+    let iterations = match loose {
+        Some(loose) => LooseNewton::new(system, loose, &locked).solve(&mut state, ws)?,
+        None => relax(system, &locked, &mut state, ws)?,
+    };
     let lock_forces_n = ws.lock_forces_n.clone();
     ws.lock_forces_n.fill(0.0);
     ws.residual_rows.fill(0.0);

@@ -25,6 +25,7 @@ pub mod fast;
 pub mod tree;
 pub mod trajectory;
 pub mod linearise;
+mod loose_statics;
 mod general;
 pub mod simulator;
 pub mod summary;

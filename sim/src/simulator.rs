@@ -7,7 +7,7 @@ use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::job::Integrator;
 use hydroflex_openapi::machine::MachineFile;
 
-use crate::equilibrium::{Equilibrium, equilibrium, start_lengths_m};
+use crate::equilibrium::{Equilibrium, equilibrium, fixed_step_start, start_lengths_m};
 use crate::fast::{self, NotPlanar, PlanarModel};
 use crate::general::GeneralRun;
 use crate::integrate::Scheme;
@@ -270,7 +270,11 @@ impl Simulator {
             );
         }
         let system = variant.system.with_payload_mass(input.payload_kg);
-        let start = equilibrium(
+        let find_start = match settings.integrator {
+            Integrator::Accurate => equilibrium,
+            Integrator::TrapezoidalIndex2 { .. } | Integrator::GeneralizedAlpha { .. } => fixed_step_start,
+        };
+        let start = find_start(
             &system,
             self.machine.file(),
             &input.angles_rad,

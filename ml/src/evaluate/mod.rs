@@ -11,6 +11,7 @@ use crate::noise::Noise;
 use crate::runs::{Runs, RunsError};
 use crate::scaling::Scaling;
 use crate::window::WindowError;
+use hydroflex_openapi::job::NoiseSpec;
 use hydroflex_openapi::model::{BaselineMetrics, EvaluationReport, TargetMetrics};
 use metrics::metrics;
 
@@ -241,12 +242,22 @@ fn coverage(estimate: &[f64], reference: &[f64], centre: f64, half_width: impl F
 /// A channel is missing.
 pub fn with_noise_of_training(model: &Model, runs: &Runs, seed: u64) -> Result<Runs, EvaluateError> {
     let config = model.config();
-    let Some(spec) = &config.provenance.spec.noise else {
+    let names: Vec<String> = config.inputs.iter().map(|c| c.name.clone()).collect();
+    with_noise(config.provenance.spec.noise.as_ref(), &names, runs, seed)
+}
+
+/// The same for noise `spec` on the channels `names`.
+pub(crate) fn with_noise(
+    spec: Option<&NoiseSpec>,
+    names: &[String],
+    runs: &Runs,
+    seed: u64,
+) -> Result<Runs, EvaluateError> {
+    let Some(spec) = spec else {
         return Ok(runs.clone());
     };
-    let names: Vec<String> = config.inputs.iter().map(|c| c.name.clone()).collect();
-    let positions = runs.positions(&names)?;
-    let inputs = runs.select(&names)?;
+    let positions = runs.positions(names)?;
+    let inputs = runs.select(names)?;
     let noisy = Noise::new(spec, &inputs.channels, runs.sample_time_s)?.add(&inputs, seed, EVALUATION_STREAM);
     let mut disturbed = runs.clone();
     for (run, noisy) in disturbed.runs.iter_mut().zip(noisy.runs) {

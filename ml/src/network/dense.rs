@@ -200,7 +200,7 @@ impl<B: DenseKernels, C: CheckpointStrategy> DenseOps for Autodiff<B, C> {
 mod tests {
     use super::*;
     use crate::network::{Loss, NetworkTensors, batch_tensor, init::initial_parameters};
-    use crate::structure::Structure;
+    use crate::structure::{Form, Structure};
     use burn::tensor::Device;
     use hydroflex_openapi::model::DenseLayer;
 
@@ -267,7 +267,7 @@ mod tests {
             let loss_of = |p: &[f64]| loss_f64(&layers, p, &windows, &targets, kind);
             let device = Device::flex().autodiff();
             let mut gradient = vec![0.0; parameters.len()];
-            let loss = NetworkTensors::new(&layers, &parameters, &device).loss_and_gradient(
+            let loss = NetworkTensors::new(Form::Dense, &layers, &parameters, &device).loss_and_gradient(
                 batch_tensor(windows.clone(), 5, &device),
                 batch_tensor(targets.clone(), 5, &device),
                 kind,

@@ -25,10 +25,10 @@
               load would double its cost: lengths are compared before the loops"
 )]
 
-use super::activate::activate;
-pub use super::simd::{Level, level};
-use super::simd::{Simd, dispatch};
+use crate::activate::activate;
 use crate::model::weights::LinearWeights;
+pub use crate::simd::{Level, level};
+use crate::simd::{Simd, dispatch};
 use hydroflex_openapi::model::Activation;
 
 /// Windows in a panel: two AVX-512 registers.

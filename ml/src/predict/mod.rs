@@ -5,11 +5,9 @@
 //! Windows of a recording overlap in memory, so sliding over it copies nothing either: a value of
 //! neighbouring windows is a piece of its column.
 
-mod activate;
 pub mod kernel;
 pub mod panel;
 mod scale;
-mod simd;
 pub mod skip;
 pub mod guard;
 pub mod sliding;

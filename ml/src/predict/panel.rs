@@ -7,7 +7,7 @@
 )]
 
 use super::kernel::PANEL;
-use super::simd::{Level, level};
+use crate::simd::{Level, level};
 
 /// Rows and values that are turned at once.
 const BLOCK: usize = 8;

@@ -7,7 +7,7 @@
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
 
-use super::simd::{Simd, dispatch, level};
+use crate::simd::{Simd, dispatch, level};
 use hydroflex_openapi::model::ModelConfig;
 
 /// What is done to the values of one window, in their order.

@@ -17,8 +17,8 @@
 )]
 
 use super::kernel::{Level, PANEL, level, pack};
-use super::simd::{Simd, dispatch};
 use crate::model::weights::SkipWeights;
+use crate::simd::{Simd, dispatch};
 use hydroflex_openapi::model::{ScaledChannel, Schedule};
 
 /// Outputs in a group.

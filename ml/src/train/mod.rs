@@ -7,35 +7,31 @@
 
 pub mod prepare;
 pub mod adam;
+pub mod autodiff;
 pub mod checkpoint;
+pub mod comparison;
+pub mod step;
 
 use crate::least_squares::SpectrumError;
 use crate::model::ModelError;
 use crate::network::init::epoch_order;
-use crate::network::{NetworkTensors, batch_tensor};
 use crate::runs::{Runs, RunsError};
 use crate::scheduled::NormalEquationsError;
-use crate::structure::StructureError;
+use crate::structure::{Form, Structure, StructureError};
 use crate::window::WindowError;
-use adam::Adam;
-use burn::tensor::{Device, Tensor, TensorData};
+use autodiff::Autodiff;
 use checkpoint::TrainState;
 use hydroflex_openapi::job::TrainingSpec;
 use hydroflex_openapi::model::{EpochRecord, ModelSummary, TrainingEnd};
-use prepare::{Part, Problem, TrainingData};
+use prepare::{Problem, TrainingData};
 use sha2::{Digest, Sha256};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::{Duration, Instant};
+use step::{Samples, Step};
 
-/// Parts into which every batch is cut, one per thread. Fixed, so that sums do not depend on the
-/// number of threads.
-const BATCH_PARTS: usize = 2;
-/// Smaller batches are not cut: starting a thread's work would cost more than it saves.
-const SMALLEST_CUT: usize = 256;
-/// Validation happens when this part of the schedule has passed since the last one (20 of 1,000
-/// epochs, as in the paper).
-const VALIDATION_INTERVAL: f64 = 0.02;
+/// Validations of a training that goes its whole length (after every 20 of 1,000 epochs, as in the paper).
+const VALIDATIONS: f64 = 50.0;
 /// Least time between two checkpoints.
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(2);
 /// Early stopping: validations without improvement after which a training ends. A schedule that
@@ -43,8 +39,6 @@ const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(2);
 const PATIENCE: usize = 15;
 /// A loss this many times that of predicting the mean is divergence.
 const DIVERGENCE: f64 = 1e4;
-/// Windows per validation batch; bounds memory.
-const VALIDATION_BATCH: usize = 4096;
 
 /// Where a training stands.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -186,6 +180,11 @@ pub fn train(
     checkpoint_dir: &Path,
     out_dir: &Path,
 ) -> Result<ModelSummary, TrainError> {
+    if Structure::is_comparison(&spec.structure) {
+        return Err(TrainError::Structure(StructureError::Comparison {
+            name: spec.structure.clone(),
+        }));
+    }
     let problem = Problem::new(data, spec)?;
     let outcome = fit(&problem, &data.dataset_sha256, progress, checkpoint_dir)?;
     let summary = crate::model::write::write_model(&problem, data, &outcome, out_dir)?;
@@ -233,6 +232,7 @@ pub fn fit(
         problem,
         steps_per_epoch: problem.train.windows.len().div_ceil(problem.recipe.batch),
     };
+    let mut trainer = Trainer::new(problem);
     let ended_by = loop {
         if let Some(end) = limits.reached(&state, clock.elapsed_s()) {
             break end;
@@ -249,12 +249,12 @@ pub fn fit(
                 resumed_at,
             })
         };
-        let train_loss = epoch(problem, &limits, &mut state, &clock, &mut report)?;
+        let train_loss = epoch(&mut trainer, &limits, &mut state, &clock, &mut report)?;
         state.counters.epoch += 1;
         let fraction = limits.fraction(&state, state.counters.epoch, 0, clock.elapsed_s());
         let last = fraction >= 1.0 || problem.recipe.loss_threshold.is_some_and(|t| train_loss < t);
-        if last || fraction - state.counters.validated_at >= VALIDATION_INTERVAL {
-            validate(problem, &mut state, train_loss, fraction);
+        if last || intervals(fraction) > intervals(state.counters.validated_at) {
+            validate(&mut trainer, &mut state, train_loss, fraction);
         }
         state.counters.elapsed_s = clock.elapsed_s();
         clock = Clock {
@@ -274,7 +274,7 @@ pub fn fit(
     };
     if state.counters.best_loss.is_none() {
         let loss = state.counters.history.last().map_or(f64::NAN, |h| h.train_loss);
-        validate(problem, &mut state, loss, 1.0);
+        validate(&mut trainer, &mut state, loss, 1.0);
     }
     Ok(Outcome {
         parameters: state.best_parameters,
@@ -284,6 +284,70 @@ pub fn fit(
         ended_by,
         elapsed_s: clock.elapsed_s(),
     })
+}
+
+/// Whole intervals between validations that lie before `fraction` of the schedule.
+fn intervals(fraction: f64) -> f64 {
+    // An epoch that ends where an interval does is not left to rounding.
+    (fraction * VALIDATIONS + 1e-6).floor()
+}
+
+/// Who differentiates.
+enum Network {
+    Own(Box<Step>),
+    Burn(Autodiff),
+}
+
+impl Network {
+    fn gradient(
+        &mut self,
+        samples: Samples<'_>,
+        parameters: &[f32],
+        batch: &[u32],
+        gradient: &mut [f32],
+    ) -> f64 {
+        match self {
+            Self::Own(step) => step.gradient(samples, parameters, batch, gradient),
+            Self::Burn(network) => network.gradient(samples, parameters, batch, gradient),
+        }
+    }
+
+    fn loss(&mut self, samples: Samples<'_>, parameters: &[f32]) -> f64 {
+        match self {
+            Self::Own(step) => step.loss(samples, parameters),
+            Self::Burn(network) => network.loss(samples, parameters),
+        }
+    }
+}
+
+/// The problem with what every step needs.
+struct Trainer<'a> {
+    problem: &'a Problem,
+    network: Network,
+    train_rows: Vec<u32>,
+    validation_rows: Vec<u32>,
+    gradient: Vec<f32>,
+}
+
+impl<'a> Trainer<'a> {
+    fn new(problem: &'a Problem) -> Self {
+        Self {
+            problem,
+            network: match problem.structure.form {
+                Form::Dense => Network::Own(Box::new(Step::new(
+                    &problem.layers,
+                    &problem.whitening,
+                    problem.steps * problem.train.series.width,
+                    problem.recipe.batch,
+                    problem.loss,
+                ))),
+                _ => Network::Burn(comparison::autodiff(problem)),
+            },
+            train_rows: step::first_rows(&problem.train),
+            validation_rows: step::first_rows(&problem.validation),
+            gradient: vec![0.0; problem.parameters.len()],
+        }
+    }
 }
 
 /// Time spent in this attempt and those before it.
@@ -351,17 +415,20 @@ impl Limits<'_> {
 
 /// One pass over the training windows in this epoch's order; the mean loss.
 fn epoch(
-    problem: &Problem,
+    trainer: &mut Trainer<'_>,
     limits: &Limits<'_>,
     state: &mut TrainState,
     clock: &Clock,
     report: &mut dyn FnMut(f64, f64, &TrainState, &Clock) -> ControlFlow<()>,
 ) -> Result<f64, TrainError> {
+    let problem = trainer.problem;
     let number = state.counters.epoch;
     let noisy = problem.epoch_part(number);
-    let part = noisy.as_ref().unwrap_or(&problem.train);
+    let samples = Samples {
+        part: noisy.as_ref().unwrap_or(&problem.train),
+        first_rows: &trainer.train_rows,
+    };
     let order = epoch_order(problem.train.windows.len(), problem.recipe.seed, number);
-    let mut gradient = vec![0.0; state.parameters.len()];
     let mut sum = 0.0;
     let mut seen = 0_usize;
     let mut reported = Instant::now();
@@ -372,7 +439,9 @@ fn epoch(
             break; // The time limit fell into this epoch.
         }
         let rate = limits.rate(fraction);
-        let loss = batch_gradient(problem, part, &state.parameters, batch, &mut gradient);
+        let loss = trainer
+            .network
+            .gradient(samples, &state.parameters, batch, &mut trainer.gradient);
         if !loss.is_finite() || loss > DIVERGENCE {
             return Err(TrainError::Diverged {
                 epoch: number,
@@ -380,7 +449,7 @@ fn epoch(
                 learning_rate: rate,
             });
         }
-        state.adam.step(&mut state.parameters, &gradient, rate);
+        state.adam.step(&mut state.parameters, &trainer.gradient, rate);
         sum += loss * batch.len() as f64;
         seen += batch.len();
         if reported.elapsed() >= Duration::from_millis(100) {
@@ -393,89 +462,13 @@ fn epoch(
     Ok(sum / seen as f64)
 }
 
-/// Loss of a batch, its gradient written to `gradient`. Large batches are cut into
-/// parts that run at the same time and are summed in order.
-pub fn batch_gradient(
-    problem: &Problem,
-    part: &Part,
-    parameters: &[f32],
-    batch: &[u32],
-    gradient: &mut [f32],
-) -> f64 {
-    let divisor = (batch.len() * problem.spec.targets.len()) as f32;
-    gradient.fill(0.0);
-    if batch.len() < SMALLEST_CUT {
-        return f64::from(part_gradient(problem, part, parameters, batch, divisor, gradient));
-    }
-    let (first, second) = batch.split_at(batch.len().div_ceil(BATCH_PARTS));
-    let mut other = vec![0.0; gradient.len()];
-    let (a, b) = rayon::join(
-        || part_gradient(problem, part, parameters, first, divisor, gradient),
-        || part_gradient(problem, part, parameters, second, divisor, &mut other),
-    );
-    for (g, o) in gradient.iter_mut().zip(&other) {
-        *g += o;
-    }
-    f64::from(a) + f64::from(b)
-}
-
-fn part_gradient(
-    problem: &Problem,
-    part: &Part,
-    parameters: &[f32],
-    batch: &[u32],
-    divisor: f32,
-    gradient: &mut [f32],
-) -> f32 {
-    let plain = Device::flex();
-    let device = plain.clone().autodiff();
-    let (windows, wanted) = gather(part, batch.iter().map(|&w| w as usize));
-    let windows = whiten(problem, batch_tensor(windows, batch.len(), &plain));
-    NetworkTensors::new(&problem.layers, parameters, &device).loss_and_gradient(
-        Tensor::from_inner(windows),
-        batch_tensor(wanted, batch.len(), &device),
-        problem.loss,
-        divisor,
-        gradient,
-    )
-}
-
-/// Copies windows and what is wanted at their ends.
-fn gather(part: &Part, windows: impl ExactSizeIterator<Item = usize>) -> (Vec<f32>, Vec<f32>) {
-    let width = part.targets.width;
-    let mut values = Vec::with_capacity(windows.len() * part.windows.steps * part.series.width);
-    let mut wanted = Vec::with_capacity(windows.len() * width);
-    for index in windows {
-        let first = part.windows.first_row(index);
-        let row = first + part.windows.steps - 1;
-        values.extend_from_slice(part.series.window(first, part.windows.steps));
-        wanted.extend_from_slice(&part.wanted[row * width..(row + 1) * width]);
-    }
-    (values, wanted)
-}
-
-/// `z = P x − P x̄` for a batch; the batch itself without whitening.
-fn whiten(problem: &Problem, windows: Tensor<2>) -> Tensor<2> {
-    let components = problem.whitening.components();
-    if components == 0 {
-        return windows;
-    }
-    let device = windows.device();
-    let size = problem.whitening.projection.len() / components;
-    let projection = Tensor::from_data(
-        TensorData::new(problem.whitening.projection.clone(), [components, size]),
-        &device,
-    );
-    let offset = Tensor::from_data(
-        TensorData::new(problem.whitening.offset.clone(), [components]),
-        &device,
-    );
-    crate::network::dense::dense(windows, projection, offset, &[])
-}
-
 /// Validation loss, and the best weights if these are.
-fn validate(problem: &Problem, state: &mut TrainState, train_loss: f64, fraction: f64) {
-    let loss = validation_loss(problem, &state.parameters);
+fn validate(trainer: &mut Trainer<'_>, state: &mut TrainState, train_loss: f64, fraction: f64) {
+    let samples = Samples {
+        part: &trainer.problem.validation,
+        first_rows: &trainer.validation_rows,
+    };
+    let loss = trainer.network.loss(samples, &state.parameters);
     state.counters.validated_at = fraction;
     state.counters.history.push(EpochRecord {
         epoch: state.counters.epoch,
@@ -489,27 +482,6 @@ fn validate(problem: &Problem, state: &mut TrainState, train_loss: f64, fraction
     }
 }
 
-fn validation_loss(problem: &Problem, parameters: &[f32]) -> f64 {
-    let device = Device::flex();
-    let network = NetworkTensors::new(&problem.layers, parameters, &device);
-    let part = &problem.validation;
-    let count = part.windows.len();
-    let mut sum = 0.0;
-    for first in (0..count).step_by(VALIDATION_BATCH) {
-        let last = (first + VALIDATION_BATCH).min(count);
-        let (windows, wanted) = gather(part, first..last);
-        let output = network.forward(whiten(problem, batch_tensor(windows, last - first, &device)));
-        let output = output.into_data();
-        let values = output.as_slice::<f32>().expect("the network's output is f32");
-        sum += values
-            .iter()
-            .zip(&wanted)
-            .map(|(o, w)| problem.loss.value(f64::from(o - w)))
-            .sum::<f64>();
-    }
-    sum / (count * problem.spec.targets.len()) as f64
-}
-
 /// Hash of everything that the result is a function of.
 fn fingerprint(problem: &Problem, dataset_sha256: &str) -> String {
     let mut hash = Sha256::new();
@@ -519,10 +491,4 @@ fn fingerprint(problem: &Problem, dataset_sha256: &str) -> String {
     hash.update(checkpoint::to_bytes(&problem.train.wanted));
     hash.update(checkpoint::to_bytes(&problem.parameters));
     hex::encode(hash.finalize())
-}
-
-/// Untrained optimiser state, for callers that time steps.
-#[must_use]
-pub fn optimiser(problem: &Problem) -> Adam {
-    Adam::new(problem.parameters.len())
 }

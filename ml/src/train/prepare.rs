@@ -9,7 +9,7 @@ use crate::noise::Noise;
 use crate::runs::Runs;
 use crate::scaling::Scaling;
 use crate::scheduled::{RANGE_FACTOR, Sample, ScheduledMap};
-use crate::structure::Structure;
+use crate::structure::{Form, Structure};
 use crate::window::{Series, WindowError, Windows, window_steps};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
@@ -225,7 +225,7 @@ impl Problem {
             WindowRule::Given { window_s } => window_steps(window_s, data.train.sample_time_s)?,
             _ => return Err(TrainError::NoWindow),
         };
-        let structure = Structure::parse(&spec.structure, steps, spec.width)?;
+        let structure = Structure::parse_any(&spec.structure, steps, spec.width)?;
 
         let scaling: fn(&Runs) -> Scaling = if published { Scaling::paper } else { Scaling::fit };
         let (input_scaling, target_scaling) = (scaling(&seen), scaling(&train_targets));
@@ -299,16 +299,15 @@ impl Problem {
         } else {
             Vec::new()
         };
-        let whitening = if published {
+        let whitening = if published || structure.form != Form::Dense {
             Whitening::default()
         } else {
             whitening(&spectrum, &moments)
         };
         let window_values = steps * spec.inputs.len();
-        let first_inputs = if published {
-            window_values
-        } else {
-            whitening.components()
+        let first_inputs = match whitening.components() {
+            0 => window_values,
+            components => components,
         };
         let layers = structure.layers(first_inputs, spec.targets.len());
         let recipe = recipe(&spec, published, data.train.runs.len(), train.windows.len());

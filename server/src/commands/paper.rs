@@ -13,12 +13,14 @@ use anyhow::{Context as _, ensure};
 use hydroflex_dataset::Dataset;
 use hydroflex_ml::dataset::load_all;
 use hydroflex_ml::evaluate::faults::fault_rates;
-use hydroflex_ml::evaluate::{evaluate, with_noise_of_training};
+use hydroflex_ml::evaluate::{EvaluateError, evaluate, with_noise_of_training};
 use hydroflex_ml::model::Model;
 use hydroflex_ml::runs::Runs;
+use hydroflex_ml::structure::Structure;
+use hydroflex_ml::train::comparison::Comparison;
 use hydroflex_ml::train::{Progress, train_dataset};
 use hydroflex_openapi::job::{
-    Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowRule,
+    Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowCut, WindowRule,
 };
 use hydroflex_openapi::model::{EvaluationReport, FaultRate};
 use hydroflex_sim::machine::Machine;
@@ -67,7 +69,11 @@ pub struct Args {
     /// Sensor sets, separated by commas
     #[arg(long, value_enum, value_delimiter = ',', default_value = "all,usp,us")]
     pub sensors: Vec<SensorSet>,
-    /// Structures, separated by commas: `best`, L, RLR, TLTLT, TLSLTLSLT, ELE, …
+    /// How the paper's letters are trained, separated by commas: `ours`, `published` (disjoint windows, learning rate
+    /// 1e-4, a batch of an eighth of the runs, at most 1,000 epochs); other structures always as we do
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "ours")]
+    pub recipes: Vec<Recipe>,
+    /// Structures, separated by commas: `best`, L, RLR, TLTLT, TLSLTLSLT, ELE, …; for comparison RNN, LSTM, CNN
     #[arg(long, value_delimiter = ',', default_value = "best")]
     pub structures: Vec<String>,
     /// Trainings of each cell, seeds 0, 1, …
@@ -120,6 +126,31 @@ impl NoiseChoice {
         match self {
             Self::None => None,
             Self::Crane => Some(NoiseSpec::Level(NoiseLevel::Crane)),
+        }
+    }
+}
+
+/// How a network is trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Recipe {
+    /// All overlapping windows, a learning rate that falls to zero
+    #[default]
+    Ours,
+    /// As in the published scripts
+    Published,
+}
+
+impl Recipe {
+    /// Whether a structure is trained in this way: the published way belongs to the paper's letters.
+    fn applies_to(self, structure: &str) -> bool {
+        self == Self::Ours || !(structure == "best" || Structure::is_comparison(structure))
+    }
+
+    fn windows(self) -> WindowCut {
+        match self {
+            Self::Ours => WindowCut::Overlapping,
+            Self::Published => WindowCut::Disjoint,
         }
     }
 }
@@ -205,6 +236,8 @@ struct Cell {
     trained: Payload,
     sensors: SensorSet,
     structure: String,
+    #[serde(default)]
+    recipe: Recipe,
     noise: NoiseChoice,
     seed: u64,
     /// As asked for.
@@ -226,6 +259,9 @@ struct Cell {
     other_payloads: Vec<(f64, f64)>,
     /// On the validation runs: short, of the same kind as the training runs.
     validation_mae: Vec<f64>,
+    /// Hash of the training data, where no model folder says it: of networks for comparison.
+    #[serde(default)]
+    trained_on: Option<String>,
 }
 
 /// Payload of a data set.
@@ -299,14 +335,15 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     for trained in &sets {
         for &sensors in &args.sensors {
             for structure in &args.structures {
-                for &noise in &args.noise {
+                let recipes = args.recipes.iter().filter(|recipe| recipe.applies_to(structure));
+                for (&recipe, &noise) in recipes.flat_map(|r| args.noise.iter().map(move |n| (r, n))) {
                     for seed in 0..args.seeds {
                         let study = Study {
                             args: &args,
                             sets: &sets,
                             trained,
                         };
-                        cells.extend(study.cells(sensors, structure, noise, seed)?);
+                        cells.extend(study.cells(sensors, structure, recipe, noise, seed)?);
                     }
                 }
             }
@@ -321,10 +358,17 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     let text = report::markdown(&args, &simulator.machine().file().name, &cells);
     let path = args.out.join("report.md");
     std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
+    let picture = args.out.join("report.svg");
+    std::fs::write(&picture, report::picture(&cells).to_svg())
+        .with_context(|| format!("cannot write {}", picture.display()))?;
     if args.json {
         return print_json(&cells);
     }
-    print_line(format_args!("{text}\nreport: {}", path.display()))
+    print_line(format_args!(
+        "{text}\nreport: {}, picture: {}",
+        path.display(),
+        picture.display()
+    ))
 }
 
 /// What `--short` stands for; whatever was given differently stays.
@@ -456,6 +500,14 @@ fn data_set(
     Ok(dataset)
 }
 
+/// A network for comparison as it was asked for.
+struct Asked {
+    sensors: SensorSet,
+    noise: NoiseChoice,
+    spec: TrainingSpec,
+    name: String,
+}
+
 /// What the trainings on one data set share.
 struct Study<'a> {
     args: &'a Args,
@@ -469,6 +521,7 @@ impl Study<'_> {
         &self,
         sensors: SensorSet,
         structure: &str,
+        recipe: Recipe,
         noise: NoiseChoice,
         seed: u64,
     ) -> anyhow::Result<Vec<Cell>> {
@@ -488,26 +541,31 @@ impl Study<'_> {
                 window_s: steps as f64 * SAMPLE_S,
             },
             seed,
-            epochs: self.args.epochs,
+            // The published length belongs to the published way.
+            epochs: self.args.epochs.filter(|_| recipe == Recipe::Ours),
             time_limit_s: self.args.time_limit_s,
             noise: noise.spec(),
+            windows: recipe.windows(),
             ..TrainingSpec::default()
         };
         let noisy = if noise == NoiseChoice::Crane { "-crane" } else { "" };
-        let name = format!("{}-{structure}{noisy}-{seed}", sensors.name());
+        let published = if recipe == Recipe::Published {
+            "-published"
+        } else {
+            ""
+        };
+        let name = format!("{}-{structure}{published}{noisy}-{seed}", sensors.name());
         let path = folder.join(format!("{name}.json"));
-        let evaluated: Vec<(f64, &Dataset)> = self
-            .sets
-            .iter()
-            .filter_map(|set| match (set.payload, &set.evaluation) {
-                (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
-                _ => None,
-            })
-            .filter(|(kg, _)| match payload {
-                Payload::Fixed(own) => own.to_bits() == kg.to_bits(),
-                Payload::Range { .. } => true,
-            })
-            .collect();
+        let evaluated = self.evaluated();
+        if Structure::is_comparison(structure) {
+            let asked = Asked {
+                sensors,
+                noise,
+                spec,
+                name,
+            };
+            return self.comparison(asked, &evaluated);
+        }
         if let Some(cells) = finished(&path, training, &spec, &evaluated) {
             return Ok(cells);
         }
@@ -533,7 +591,7 @@ impl Study<'_> {
         let model = Model::load(&model_dir)?;
         let mut cells = Vec::new();
         for (payload_kg, evaluation) in evaluated {
-            let runs = evaluation_parts(&model, evaluation, seed)
+            let runs = parts_for(&model, evaluation, seed)
                 .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
             let sha256 = evaluation.dataset_sha256();
             let report = |runs: &Runs| anyhow::Ok(evaluate(&model, runs, sha256)?.report);
@@ -542,6 +600,7 @@ impl Study<'_> {
                 trained: *payload,
                 sensors,
                 structure: structure.to_owned(),
+                recipe,
                 noise,
                 seed,
                 spec: spec.clone(),
@@ -557,6 +616,89 @@ impl Study<'_> {
                 faults: fault_rates(&model, &runs.calm)?,
                 other_payloads: self.other_payloads(&model, seed)?,
                 validation_mae: summary.validation.iter().map(|m| m.mae).collect(),
+                trained_on: None,
+            };
+            if !self.args.json {
+                print_line(format_args!("{}", report::line(&cell)))?;
+            }
+            cells.push(cell);
+        }
+        std::fs::write(&path, serde_json::to_vec_pretty(&cells)?)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        Ok(cells)
+    }
+
+    /// The evaluation sets of the payloads that the trained network is for.
+    fn evaluated(&self) -> Vec<(f64, &Dataset)> {
+        let payload = self.trained.payload;
+        self.sets
+            .iter()
+            .filter_map(|set| match (set.payload, &set.evaluation) {
+                (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
+                _ => None,
+            })
+            .filter(|(kg, _)| match payload {
+                Payload::Fixed(own) => own.to_bits() == kg.to_bits(),
+                Payload::Range { .. } => true,
+            })
+            .collect()
+    }
+
+    /// The same for a network for comparison, which has no folder, intervals or envelope.
+    fn comparison(&self, asked: Asked, evaluated: &[(f64, &Dataset)]) -> anyhow::Result<Vec<Cell>> {
+        let Sets {
+            payload,
+            folder,
+            training,
+            ..
+        } = self.trained;
+        let Asked {
+            sensors,
+            noise,
+            spec,
+            name,
+        } = asked;
+        let path = folder.join(format!("{name}.json"));
+        if let Some(cells) = compared(&path, training, &spec, evaluated) {
+            return Ok(cells);
+        }
+        let bar = super::train::training_bar(self.args.json);
+        let mut progress = |progress: Progress| {
+            super::train::show(&bar, &progress);
+            ControlFlow::Continue(())
+        };
+        let checkpoint = folder.join(format!(".{name}.checkpoint"));
+        let network = Comparison::train_dataset(training, &spec, &mut progress, &checkpoint);
+        bar.finish_and_clear();
+        let network = network.with_context(|| format!("cannot train {name} at {}", payload.name()))?;
+        // Only an empty directory is removed: whatever else is in it is not ours.
+        let _ = std::fs::remove_dir(&checkpoint);
+        let mut cells = Vec::new();
+        for &(payload_kg, evaluation) in evaluated {
+            let noisy = |runs: &Runs| network.with_noise_of_training(runs, spec.seed);
+            let runs = evaluation_parts(&network.channels(), evaluation, &noisy)
+                .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
+            let report = |runs: &Runs| network.evaluate(runs, evaluation.dataset_sha256());
+            let cell = Cell {
+                payload_kg,
+                trained: *payload,
+                sensors,
+                structure: spec.structure.clone(),
+                recipe: Recipe::Ours,
+                noise,
+                seed: spec.seed,
+                spec: spec.clone(),
+                window_steps: payload.window_steps(),
+                parameters: network.parameters(),
+                train_seconds: network.train_seconds,
+                cycle: report(&runs.cycle)?,
+                random: report(&runs.random)?,
+                calm: report(&runs.calm)?,
+                flagged: None,
+                faults: Vec::new(),
+                other_payloads: Vec::new(),
+                validation_mae: Vec::new(),
+                trained_on: Some(training.dataset_sha256().to_owned()),
             };
             if !self.args.json {
                 print_line(format_args!("{}", report::line(&cell)))?;
@@ -578,7 +720,7 @@ impl Study<'_> {
             if let (Payload::Fixed(kg), Some(evaluation)) = (set.payload, &set.evaluation)
                 && kg.to_bits() != own.to_bits()
             {
-                let runs = evaluation_parts(model, evaluation, seed)?.calm;
+                let runs = parts_for(model, evaluation, seed)?.calm;
                 let inside = evaluate(model, &runs, evaluation.dataset_sha256())?
                     .report
                     .inside_envelope;
@@ -597,11 +739,22 @@ struct EvaluationParts {
     flagged: Runs,
 }
 
-fn evaluation_parts(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::Result<EvaluationParts> {
+fn parts_for(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::Result<EvaluationParts> {
     let config = model.config();
     let channels = config.inputs.iter().chain(&config.targets);
     let names: Vec<String> = channels.map(|c| c.name.clone()).collect();
-    let all = with_noise_of_training(model, &load_all(evaluation, &names)?, seed)?;
+    evaluation_parts(&names, evaluation, &|runs| {
+        with_noise_of_training(model, runs, seed)
+    })
+}
+
+/// Runs of `evaluation` with the channels `names` and what `noisy` makes of them.
+fn evaluation_parts(
+    names: &[String],
+    evaluation: &Dataset,
+    noisy: &dyn Fn(&Runs) -> Result<Runs, EvaluateError>,
+) -> anyhow::Result<EvaluationParts> {
+    let all = noisy(&load_all(evaluation, names)?)?;
     let is_calm = |run_id: u64| evaluation.run(run_id).is_some_and(|row| row.flags.is_empty());
     let part = |chosen: &dyn Fn(u64) -> bool, count: usize| Runs {
         channels: all.channels.clone(),
@@ -626,6 +779,23 @@ fn evaluation_parts(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::R
         "none of {RANDOM_CANDIDATES} random runs stays within stroke and pressures"
     );
     Ok(parts)
+}
+
+/// As [`finished`], for networks for comparison.
+fn compared(
+    path: &Path,
+    training: &Dataset,
+    spec: &TrainingSpec,
+    evaluated: &[(f64, &Dataset)],
+) -> Option<Vec<Cell>> {
+    let cells: Vec<Cell> = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
+    let matches = |(cell, (kg, evaluation)): (&Cell, &(f64, &Dataset))| {
+        cell.payload_kg.to_bits() == kg.to_bits()
+            && cell.spec == *spec
+            && cell.trained_on.as_deref() == Some(training.dataset_sha256())
+            && cell.cycle.dataset_sha256 == evaluation.dataset_sha256()
+    };
+    (cells.len() == evaluated.len() && cells.iter().zip(evaluated).all(matches)).then_some(cells)
 }
 
 /// Cells of an earlier call, if they belong to these data sets and were asked for in the same way.

@@ -10,21 +10,23 @@ pub fn skew(a: &Vector3<f64>) -> Matrix3<f64> {
 
 /// Rotation matrix `A` (body → global) of the Euler parameters `θ = [e0, e1, e2, e3]`.
 ///
-/// The form with `e0² + e_i² − 1/2` is the one of theory note §1.1. Away from `|θ| = 1`, where
-/// velocity-level constraints let the solution drift, forms that agree on the unit sphere differ.
+/// Forms that agree on the unit sphere differ away from `|θ| = 1`, where velocity-level constraints and unfinished Newton
+/// iterations let the solution drift. This one has `1 − 2 (e_j² + e_k²)` on the diagonal, as Exudyn (its `RotationMatrix`
+/// at θ = (0.9, 0.1, 0.3, 0.2) begins with 0.74); with theory note §1.1's `2 (e0² + e_i²) − 1` angles and lengths of the
+/// index-2 solution differ from it by 2e-6 of range.
 #[must_use]
 pub fn rotation_matrix(theta: &Vector4<f64>) -> Matrix3<f64> {
     let (e0, e1, e2, e3) = (theta[0], theta[1], theta[2], theta[3]);
     2.0 * Matrix3::new(
-        e0 * e0 + e1 * e1 - 0.5,
+        0.5 - e2 * e2 - e3 * e3,
         e1 * e2 - e0 * e3,
         e1 * e3 + e0 * e2,
         e1 * e2 + e0 * e3,
-        e0 * e0 + e2 * e2 - 0.5,
+        0.5 - e1 * e1 - e3 * e3,
         e2 * e3 - e0 * e1,
         e1 * e3 - e0 * e2,
         e2 * e3 + e0 * e1,
-        e0 * e0 + e3 * e3 - 0.5,
+        0.5 - e1 * e1 - e2 * e2,
     )
 }
 
@@ -91,6 +93,14 @@ mod tests {
         // Rounding of a few products of numbers below one.
         assert!((a * a.transpose() - Matrix3::identity()).norm() < 1e-15 * 10.0);
         assert!((a.determinant() - 1.0).abs() < 1e-14);
+    }
+
+    #[test]
+    fn rotation_matrix_off_the_unit_sphere_is_that_of_exudyn() {
+        // mbs.GetNodeOutput(node, RotationMatrix) of Exudyn 1.13.6.
+        let a = rotation_matrix(&Vector4::new(0.9, 0.1, 0.3, 0.2));
+        let exudyn = Matrix3::new(0.74, -0.3, 0.58, 0.42, 0.9, -0.06, -0.5, 0.3, 0.8);
+        assert!((a - exudyn).norm() < 1e-15, "{a}");
     }
 
     #[test]

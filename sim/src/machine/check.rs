@@ -54,6 +54,7 @@ impl Checker<'_> {
         for (i, g) in file.gravity_m_per_s2.iter().enumerate() {
             self.range(&format!("gravity_m_per_s2[{i}]"), *g, (-100.0, 100.0), "m/s²")?;
         }
+        self.statics()?;
         self.bodies()?;
         self.joints()?;
         self.cylinders()?;
@@ -63,6 +64,34 @@ impl Checker<'_> {
             self.ascending("payload.range_kg", payload.range_kg, plausible::MASS_KG, "kg")?;
         }
         self.sensors()
+    }
+
+    fn statics(&self) -> Checked {
+        let Some(statics) = &self.file.conventions.statics else {
+            return Ok(());
+        };
+        let at = "conventions.statics";
+        self.range(
+            &format!("{at}.load_steps"),
+            f64::from(statics.load_steps),
+            (1.0, 1000.0),
+            "steps",
+        )?;
+        self.range(
+            &format!("{at}.relative_tolerance"),
+            statics.relative_tolerance,
+            (1e-12, 1e-2),
+            "of the first residual",
+        )?;
+        if let Some(ground) = &statics.ground_body {
+            let at = format!("{at}.ground_body");
+            self.range(&format!("{at}.mass_kg"), ground.mass_kg, plausible::MASS_KG, "kg")?;
+            for (i, x) in ground.centre_of_mass_m.iter().enumerate() {
+                let key = format!("{at}.centre_of_mass_m[{i}]");
+                self.range(&key, *x, plausible::COORDINATE_M, "m")?;
+            }
+        }
+        Ok(())
     }
 
     fn bodies(&self) -> Checked {

@@ -1,8 +1,9 @@
 //! `report.md`: tables in physical units, means over the seeds.
 
-use super::{Args, Cell, NoiseChoice, Payload, RANDOM_EVALUATED};
+use super::{Args, Cell, NoiseChoice, Payload, RANDOM_EVALUATED, Recipe};
 use hydroflex_ml::evaluate::faults::{EFFECT, STRETCH_S};
 use hydroflex_ml::evaluate::table::{PUBLISHED, display_unit, significant};
+use hydroflex_ml::plot::errors::{ErrorKind, ErrorPanel, ErrorPicture, ErrorRow};
 use hydroflex_openapi::model::{EvaluationReport, TargetMetrics};
 use std::fmt::Write as _;
 
@@ -11,9 +12,9 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
     let mut text = format!(
         "# The published study, repeated\n\n\
          Machine `{machine}`, integrator `{:?}` at 5 ms, {} training runs of 1 s per payload, all overlapping \
-         windows, {} seed{} per cell (means are shown, the range of the seeds in brackets). None of the evaluation \
-         signals was seen: the published 10 s cycle, and the first {RANDOM_EVALUATED} random 10 s runs that stay within \
-         stroke and pressures.\n",
+         windows unless trained as published, {} seed{} per cell (means are shown, the range of the seeds in brackets). None of \
+         the evaluation signals was seen: the published 10 s cycle, and the first {RANDOM_EVALUATED} random 10 s runs that stay \
+         within stroke and pressures.\n",
         args.integrator,
         args.runs,
         args.seeds,
@@ -34,7 +35,7 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
             text.push_str(&row(group, t));
         }
         for group in groups(cells) {
-            if first_of_its_sensors(cells, group) {
+            if first_with_baselines(cells, group) {
                 text.push_str(&baselines(&group[0], t));
             }
         }
@@ -57,41 +58,59 @@ fn percent(value: f64) -> String {
     format!("{:.1} %", 100.0 * value)
 }
 
+/// `97.5 %`, or `97.5–99.0 %` where they differ.
+fn percents(values: impl Iterator<Item = f64>) -> String {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    if low > high {
+        return String::new();
+    }
+    let (first, last) = (percent(low), percent(high));
+    if first == last {
+        first
+    } else {
+        format!("{:.1}–{last}", 100.0 * low)
+    }
+}
+
 /// Coverage of the intervals on the cycle and on all random runs without a flag, by thirds of amplitude.
 fn intervals(text: &mut String, cells: &[Cell]) {
     text.push_str(
         "\n## 90 % intervals\n\nCalibrated on other random 10 s runs and on the validation runs. Coverage of the cycle and of \
-         all random 10 s runs without a flag, these also by thirds of the reference's distance from the mean.\n\n\
-         | payload | sensors | structure | target | runs | cycle | random | smallest third | middle | largest | mean width |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|\n",
+         all random 10 s runs without a flag, lowest and highest of the targets and seeds; of the random runs also by thirds of \
+         the reference's distance from the mean. Width: first target.\n\n\
+         | payload | sensors | structure | runs | cycle | random | smallest third | middle | largest | mean width |\n\
+         |---|---|---|---|---|---|---|---|---|---|\n",
     );
     for group in groups(cells) {
         let head = &group[0];
-        for (t, target) in head.calm.targets.iter().enumerate() {
-            let (factor, unit) = display(target);
-            let part = |get: &dyn Fn(&Cell) -> Option<f64>| {
-                let values: Vec<f64> = group.iter().filter_map(get).collect();
-                if values.is_empty() {
-                    return String::new();
-                }
-                percent(values.iter().sum::<f64>() / values.len() as f64)
-            };
-            let third = |i: usize| part(&move |c| c.calm.targets[t].coverage_thirds.map(|thirds| thirds[i]));
-            let _ = writeln!(
-                text,
-                "| {} | `{}` | {} | {} | {} | {} | {} | {} | {} {unit} |",
-                label(head),
-                target.target,
-                head.calm.runs,
-                part(&|c| c.cycle.targets[t].coverage),
-                part(&|c| c.calm.targets[t].coverage),
-                third(0),
-                third(1),
-                third(2),
-                mean(group, |c| factor
-                    * c.calm.targets[t].interval_width.unwrap_or(0.0)),
-            );
-        }
+        let Some(first) = head.calm.targets.first().filter(|t| t.coverage.is_some()) else {
+            continue;
+        };
+        let (factor, unit) = display(first);
+        let span = |get: &dyn Fn(&Cell, usize) -> Option<f64>| {
+            let values = group
+                .iter()
+                .flat_map(|c| (0..c.calm.targets.len()).filter_map(move |t| get(c, t)));
+            percents(values)
+        };
+        let third = |i: usize| {
+            span(&move |c: &Cell, t: usize| c.calm.targets[t].coverage_thirds.map(|thirds| thirds[i]))
+        };
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {} | {} | {} | {} | {} {unit} |",
+            label(head),
+            head.calm.runs,
+            span(&|c, t| c.cycle.targets[t].coverage),
+            span(&|c, t| c.calm.targets[t].coverage),
+            third(0),
+            third(1),
+            third(2),
+            average(group, |c| factor
+                * c.calm.targets[0].interval_width.unwrap_or(0.0)),
+        );
     }
 }
 
@@ -99,48 +118,59 @@ fn intervals(text: &mut String, cells: &[Cell]) {
 fn envelope(text: &mut String, cells: &[Cell]) {
     let _ = write!(
         text,
-        "\n## Envelope\n\nPart of the windows that are flagged. A stuck sensor counts where the truth is, on average over the \
-         window, at least {:.0} % of the training range away from the stuck value: before, nobody can know. In brackets the \
-         cases (a sensor stuck for {} s, a run with two channels swapped) of which at least one such window is flagged. \
-         False alarms are flagged windows of honest runs: all random 10 s runs without a flag.\n\n\
-         | payload | sensors | structure | false alarms: cycle | random | fault | flagged windows | found cases |\n\
+        "\n## Envelope\n\nPart of the windows that are flagged, lowest and highest of the seeds. A stuck sensor counts where the \
+         truth is, on average over the window, at least {:.0} % of the training range away from the stuck value: before, nobody \
+         can know. The worst sensor and the worst pair are named; in brackets the cases (a sensor stuck for {} s, a run with two \
+         channels swapped) of which at least one such window is flagged. False alarms are flagged windows of honest runs: the \
+         cycle, and all random 10 s runs without a flag.\n\n\
+         | payload | sensors | structure | false alarms: cycle | random | worst stuck sensor | worst swapped pair | other payloads |\n\
          |---|---|---|---|---|---|---|---|\n",
         100.0 * EFFECT,
         STRETCH_S,
     );
     for group in groups(cells) {
         let head = &group[0];
-        let alarms = |report: &EvaluationReport| {
-            report
-                .inside_envelope
-                .map_or_else(String::new, |i| percent(1.0 - i))
+        if head.faults.is_empty() {
+            continue;
+        }
+        let alarms = |report: fn(&Cell) -> &EvaluationReport| {
+            percents(
+                group
+                    .iter()
+                    .filter_map(|c| report(c).inside_envelope.map(|i| 1.0 - i)),
+            )
         };
-        for (f, fault) in head.faults.iter().enumerate() {
-            let average =
-                |get: &dyn Fn(&Cell) -> f64| percent(group.iter().map(get).sum::<f64>() / group.len() as f64);
-            let _ = writeln!(
-                text,
-                "| {} | {} | {} | {} | {} ({} windows) | {} ({}) |",
-                label(head),
-                alarms(&head.cycle),
-                alarms(&head.calm),
-                fault.fault,
-                average(&|c| c.faults.get(f).map_or(0.0, |f| f.flagged)),
-                fault.windows,
-                average(&|c| c.faults.get(f).map_or(0.0, |f| f.found)),
-                fault.cases,
-            );
-        }
-        for (kg, flagged) in &head.other_payloads {
-            let _ = writeln!(
-                text,
-                "| {} | {} | {} | payload {kg} kg | {} | |",
-                label(head),
-                alarms(&head.cycle),
-                alarms(&head.calm),
-                percent(*flagged),
-            );
-        }
+        let worst = |kind: &str| {
+            let kinds = || (0..head.faults.len()).filter(|&f| head.faults[f].fault.ends_with(kind));
+            let rates = |f: usize| group.iter().filter_map(move |c| c.faults.get(f));
+            let lowest = |f: usize| rates(f).map(|r| r.flagged).fold(f64::INFINITY, f64::min);
+            kinds()
+                .min_by(|&a, &b| lowest(a).total_cmp(&lowest(b)))
+                .map_or_else(String::new, |f| {
+                    format!(
+                        "{}: {} ({})",
+                        head.faults[f].fault.trim_end_matches(kind).trim_end(),
+                        percents(rates(f).map(|r| r.flagged)),
+                        percents(rates(f).map(|r| r.found))
+                    )
+                })
+        };
+        let others: Vec<String> = (0..head.other_payloads.len())
+            .map(|p| {
+                let flagged = group.iter().filter_map(|c| c.other_payloads.get(p)).map(|o| o.1);
+                format!("{} kg: {}", head.other_payloads[p].0, percents(flagged))
+            })
+            .collect();
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {} | {} | {} |",
+            label(head),
+            alarms(|c| &c.cycle),
+            alarms(|c| &c.calm),
+            worst("stuck"),
+            worst("swapped"),
+            others.join("; ")
+        );
     }
     text.push_str(
         "\n## Beyond the training region\n\nRandom 10 s runs that hit an end stop, cavitate or leave the supply's pressures: \
@@ -172,16 +202,102 @@ fn label(cell: &Cell) -> String {
         Payload::Fixed(_) => String::new(),
         Payload::Range { min, max } => format!(", payload unknown in {min}–{max} kg"),
     };
+    let recipe = match cell.recipe {
+        Recipe::Ours => "",
+        Recipe::Published => ", trained as published",
+    };
     let noise = match cell.noise {
         NoiseChoice::None => "",
         NoiseChoice::Crane => ", crane noise",
     };
     format!(
-        "{} kg | {} | {}{trained}{noise}",
+        "{} kg | {} | {}{recipe}{trained}{noise}",
         cell.payload_kg,
         cell.sensors.label(),
         cell.structure
     )
+}
+
+/// Errors of the first target on the published cycle, one panel per payload and sensors.
+pub(super) fn picture(cells: &[Cell]) -> ErrorPicture {
+    let unit = cells
+        .first()
+        .and_then(|cell| cell.cycle.targets.first())
+        .map_or("", |target| display(target).1);
+    let mut panels: Vec<ErrorPanel> = Vec::new();
+    for group in groups(cells).filter(|group| matches!(group[0].trained, Payload::Fixed(_))) {
+        let head = &group[0];
+        let Some(target) = head.cycle.targets.first() else {
+            continue;
+        };
+        let factor = display(target).0;
+        let noise = if head.noise == NoiseChoice::Crane {
+            ", crane noise"
+        } else {
+            ""
+        };
+        let name = format!("{} kg, {}{noise}", head.payload_kg, head.sensors.label());
+        if panels.iter().all(|panel| panel.name != name) {
+            let mut rows = Vec::new();
+            for baseline in &head.cycle.baselines {
+                let mean = factor * baseline.targets[0].mae;
+                rows.push(ErrorRow {
+                    name: baseline.name.replace('_', " "),
+                    mean,
+                    range: (mean, mean),
+                    kind: ErrorKind::Baseline,
+                });
+            }
+            let published = PUBLISHED.iter().find(|p| {
+                p.payload_kg.to_bits() == head.payload_kg.to_bits()
+                    && target.target.starts_with("deflection_")
+            });
+            rows.extend(published.map(|p| ErrorRow {
+                name: "published".to_owned(),
+                mean: p.deflection_mae_mm,
+                range: (p.deflection_mae_mm, p.deflection_mae_mm),
+                kind: ErrorKind::Published,
+            }));
+            panels.push(ErrorPanel {
+                name: name.clone(),
+                rows,
+            });
+        }
+        let values = || group.iter().map(|c| factor * c.cycle.targets[0].mae);
+        let recipe = if head.recipe == Recipe::Published {
+            ", trained as published"
+        } else {
+            ""
+        };
+        if let Some(panel) = panels.iter_mut().find(|panel| panel.name == name) {
+            panel.rows.push(ErrorRow {
+                name: format!("{}{recipe}", head.structure),
+                mean: values().sum::<f64>() / group.len() as f64,
+                range: (
+                    values().fold(f64::INFINITY, f64::min),
+                    values().fold(f64::NEG_INFINITY, f64::max),
+                ),
+                kind: ErrorKind::Network,
+            });
+        }
+    }
+    for panel in &mut panels {
+        panel.rows.sort_by(|a, b| b.mean.total_cmp(&a.mean));
+    }
+    ErrorPicture {
+        title: "Errors on the published 10 s cycle".to_owned(),
+        subtitle: cells
+            .first()
+            .and_then(|cell| cell.cycle.targets.first())
+            .map_or_else(String::new, |target| {
+                format!(
+                    "{}, never seen in training; bars: lowest to highest of the seeds",
+                    target.target
+                )
+            }),
+        unit: unit.to_owned(),
+        panels,
+    }
 }
 
 /// One line for the terminal.
@@ -210,7 +326,7 @@ fn display(metrics: &TargetMetrics) -> (f64, &str) {
 }
 
 fn same(a: &Cell, b: &Cell) -> bool {
-    same_data(a, b) && a.structure == b.structure
+    same_data(a, b) && a.structure == b.structure && a.recipe == b.recipe
 }
 
 /// Same runs, sensors and noise: the baselines are the same.
@@ -226,12 +342,17 @@ fn groups(cells: &[Cell]) -> impl Iterator<Item = &[Cell]> {
     cells.chunk_by(same)
 }
 
-fn first_of_its_sensors(cells: &[Cell], group: &[Cell]) -> bool {
+fn first_with_baselines(cells: &[Cell], group: &[Cell]) -> bool {
     let head = &group[0];
     cells
         .iter()
-        .find(|c| same_data(c, head))
-        .is_some_and(|first| first.structure == head.structure)
+        .find(|c| same_data(c, head) && !c.cycle.baselines.is_empty())
+        .is_some_and(|first| same(first, head))
+}
+
+/// Mean over the seeds.
+fn average(group: &[Cell], value: impl Fn(&Cell) -> f64) -> String {
+    significant(group.iter().map(value).sum::<f64>() / group.len() as f64)
 }
 
 /// Mean over the seeds; with the range of the seeds where there are several.
@@ -258,11 +379,11 @@ fn row(group: &[Cell], t: usize) -> String {
     let mut text = format!("| {} |", label(head));
     let reports: [fn(&Cell) -> &EvaluationReport; 2] = [|c| &c.cycle, |c| &c.random];
     for report in reports {
-        let metric = |get: fn(&TargetMetrics) -> f64| mean(group, |c| factor * get(&report(c).targets[t]));
+        let metric = |get: fn(&TargetMetrics) -> f64| average(group, |c| factor * get(&report(c).targets[t]));
         let _ = write!(
             text,
             " {} | {} | {} | {} |",
-            metric(|m| m.mae),
+            mean(group, |c| factor * report(c).targets[t].mae),
             metric(|m| m.rmse),
             metric(|m| m.p95),
             metric(|m| m.max)

@@ -7,15 +7,29 @@
     reason = "vector code has to be inlined into the function that enables the instructions"
 )]
 
-use super::simd::Simd;
+use crate::simd::{Level, Simd, dispatch};
 use hydroflex_openapi::model::Activation;
+
+/// Activates values in place, with the instructions of `level`; `values` holds whole vectors of 16.
+pub(crate) fn apply(level: Level, activation: Activation, values: &mut [f32]) {
+    dispatch!(level, Slice::apply(activation: Activation, values: &mut [f32]));
+}
+
+struct Slice;
+
+impl Slice {
+    #[inline(always)]
+    unsafe fn apply<S: Simd>(activation: Activation, values: &mut [f32]) {
+        activate::<S>(activation, values);
+    }
+}
 
 /// Activates values in place; `values` holds whole vectors.
 ///
 /// # Safety
 /// As for [`Simd`].
 #[inline(always)]
-pub(super) unsafe fn activate<S: Simd>(activation: Activation, values: &mut [f32]) {
+pub(crate) unsafe fn activate<S: Simd>(activation: Activation, values: &mut [f32]) {
     // A closure would not be compiled for the instructions of the function that it ends up in.
     macro_rules! each {
         ($x:ident => $f:expr) => {
@@ -47,7 +61,7 @@ unsafe fn horner<S: Simd>(x: S::F, p: S::F, c: f32) -> S::F {
 }
 
 /// tanh as an odd rational function (the coefficients are Eigen's), which costs half of what an
-/// exponential does. Absolute error below 3e-7; training uses another formula, as good.
+/// exponential does. Absolute error below 3e-7; training uses the same one.
 #[inline(always)]
 unsafe fn tanh<S: Simd>(x: S::F) -> S::F {
     // From here on tanh is 1 in f32.

@@ -47,44 +47,44 @@ macro_rules! dispatch {
         #[allow(unsafe_code, clippy::too_many_arguments, reason = "the features are enabled here")]
         fn avx512($($name: $type),*) {
             // SAFETY: the features that this type names are enabled in this function.
-            unsafe { $owner::$body::<$crate::predict::simd::Avx512>($($name),*) }
+            unsafe { $owner::$body::<$crate::simd::Avx512>($($name),*) }
         }
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = "avx2,fma")]
         #[allow(unsafe_code, clippy::too_many_arguments, reason = "the features are enabled here")]
         fn avx2($($name: $type),*) {
             // SAFETY: the features that this type names are enabled in this function.
-            unsafe { $owner::$body::<$crate::predict::simd::Avx2>($($name),*) }
+            unsafe { $owner::$body::<$crate::simd::Avx2>($($name),*) }
         }
         match $level {
             #[cfg(target_arch = "x86_64")]
             #[allow(unsafe_code, reason = "the features were detected")]
             // SAFETY: `level` returns this only where the features were detected.
-            $crate::predict::simd::Level::Avx512 => unsafe { avx512($($name),*) },
+            $crate::simd::Level::Avx512 => unsafe { avx512($($name),*) },
             #[cfg(target_arch = "x86_64")]
             #[allow(unsafe_code, reason = "the features were detected")]
             // SAFETY: `level` returns this only where the features were detected.
-            $crate::predict::simd::Level::Avx2 => unsafe { avx2($($name),*) },
+            $crate::simd::Level::Avx2 => unsafe { avx2($($name),*) },
             #[cfg(not(target_arch = "x86_64"))]
             #[allow(unsafe_code, reason = "the baseline")]
             // SAFETY: this type needs the target's baseline only.
-            $crate::predict::simd::Level::Avx512 | $crate::predict::simd::Level::Avx2 => unsafe {
-                $owner::$body::<$crate::predict::simd::Portable>($($name),*)
+            $crate::simd::Level::Avx512 | $crate::simd::Level::Avx2 => unsafe {
+                $owner::$body::<$crate::simd::Portable>($($name),*)
             },
             #[allow(unsafe_code, reason = "the baseline")]
             // SAFETY: this type needs the target's baseline only.
-            $crate::predict::simd::Level::Portable => unsafe { $owner::$body::<$crate::predict::simd::Portable>($($name),*) },
+            $crate::simd::Level::Portable => unsafe { $owner::$body::<$crate::simd::Portable>($($name),*) },
         }
     }};
 }
-pub(super) use dispatch;
+pub(crate) use dispatch;
 
 /// Vectors of one instruction set.
 ///
 /// # Safety
 /// Methods may be called only where the instructions that the implementing type names are there;
 /// pointers have to be valid for as many values as the vector has.
-pub(super) trait Simd: Copy {
+pub(crate) trait Simd: Copy {
     /// [`Self::LANES`] values of f32.
     type F: Copy;
     /// Half as many values of f64.
@@ -122,7 +122,7 @@ pub(super) trait Simd: Copy {
 
 /// The target's baseline: arrays that the compiler makes vectors of.
 #[derive(Clone, Copy)]
-pub(super) struct Portable;
+pub(crate) struct Portable;
 
 #[inline(always)]
 fn zip<T: Copy, const N: usize>(a: [T; N], b: [T; N], f: impl Fn(T, T) -> T) -> [T; N] {
@@ -210,7 +210,7 @@ impl Simd for Portable {
 }
 
 #[cfg(target_arch = "x86_64")]
-pub(super) use x86::{Avx2, Avx512};
+pub(crate) use x86::{Avx2, Avx512};
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
@@ -220,11 +220,11 @@ mod x86 {
 
     /// AVX2 and FMA.
     #[derive(Clone, Copy)]
-    pub(in crate::predict) struct Avx2;
+    pub(crate) struct Avx2;
 
     /// AVX-512F.
     #[derive(Clone, Copy)]
-    pub(in crate::predict) struct Avx512;
+    pub(crate) struct Avx512;
 
     impl Simd for Avx2 {
         type F = __m256;
