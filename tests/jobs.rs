@@ -130,3 +130,80 @@ fn values(file: &[u8], name: &str) -> Vec<f64> {
     }
     all
 }
+
+/// A job of ten million runs costs its coordinator what a small one does: shards are cut as they are needed, and its
+/// data set is written as they come.
+#[test]
+fn a_job_of_ten_million_runs_is_accepted_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = |workers| {
+        let start = Start {
+            workers,
+            ..Start::default()
+        };
+        ServiceUnderTest::start(folder.path(), &start).unwrap()
+    };
+    // Columns are few so that the test writes little; how many runs a shard has does not depend on them.
+    let job = serde_json::json!({
+        "runs": 10_000_000_u64, "seed": 3, "settling_runs": 2,
+        "columns": ["valve_lift_ratio"], "sample_type": "float32"
+    });
+    let id = {
+        let service = service(0);
+        let accepted = service.submit(&job).unwrap();
+        let id = accepted.job_id.to_string();
+        assert_eq!(
+            (accepted.state, accepted.progress.runs_total),
+            (JobState::Queued, 10_000_000)
+        );
+        assert!(open_shards(&service) <= 4, "{}", open_shards(&service));
+        service.terminate().unwrap();
+        id
+    };
+    let service = service(2);
+    let simulated = |runs: u64| {
+        let status = service
+            .wait_for(&id, |status| {
+                status.progress.runs_done >= runs || status.state.is_final()
+            })
+            .unwrap();
+        assert_eq!(status.state, JobState::Simulating, "{status:?}");
+    };
+    simulated(2_000);
+    let before_kib = resident_kib(service.pid());
+    simulated(8_000);
+    let after_kib = resident_kib(service.pid());
+    // Four thousand times as many runs as now may still come: a job that cost as little as 10 bytes of memory for each
+    // run planned would show in the first figure, one that kept its samples (1.6 kB a run) in the second.
+    assert!(before_kib < 400 << 10, "{before_kib} KiB");
+    assert!(
+        after_kib < before_kib + (48 << 10),
+        "{before_kib} KiB, then {after_kib} KiB"
+    );
+    // Four to a worker, and those that a coordinator without workers had cut.
+    assert!(open_shards(&service) <= 12, "{}", open_shards(&service));
+    service.post(&format!("/v1/jobs/{id}/cancel")).unwrap();
+    let ended = service.wait_for(&id, |status| status.state.is_final()).unwrap();
+    assert_eq!(ended.state, JobState::Cancelled);
+    service.terminate().unwrap();
+}
+
+/// Shards that wait or run.
+fn open_shards(service: &ServiceUnderTest) -> u64 {
+    let metrics = String::from_utf8(service.get("/metrics").unwrap()).unwrap();
+    metrics
+        .lines()
+        .filter(|line| {
+            line.contains(r#"hydroflex_shards{state="open"}"#)
+                || line.contains(r#"hydroflex_shards{state="running"}"#)
+        })
+        .filter_map(|line| line.rsplit(' ').next()?.parse::<u64>().ok())
+        .sum()
+}
+
+/// Memory of a process that is in use.
+fn resident_kib(pid: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse().unwrap()
+}

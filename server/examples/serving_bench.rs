@@ -190,6 +190,7 @@ async fn serve(folder: PathBuf) -> anyhow::Result<()> {
         workers: 1,
         lease: Duration::from_secs(10),
         most_jobs: 1000,
+        orphan_grace: Duration::from_mins(10),
     };
     let router = hydroflex_server::app(AppState::new(Coordinator::new(ledger, blobs, config)));
     let listener = TcpListener::bind("127.0.0.1:0").await?;

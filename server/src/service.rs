@@ -21,6 +21,9 @@ const GRACE: Duration = Duration::from_secs(3);
 
 /// How long a store that is just starting is waited for.
 const PATIENCE: Duration = Duration::from_mins(1);
+/// How long objects of no data set are left alone: longer than a coordinator of a build that announces no
+/// uploads takes for one.
+const ORPHAN_GRACE: Duration = Duration::from_mins(10);
 
 /// How to run a service.
 #[derive(Debug, Clone)]
@@ -122,6 +125,7 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
             workers: config.workers,
             lease: config.lease,
             most_jobs: config.most_jobs,
+            orphan_grace: ORPHAN_GRACE,
         },
     );
     let mut state = AppState::new(coordinator.clone());

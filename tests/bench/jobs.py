@@ -130,11 +130,45 @@ def sizes(data):
     }
 
 
+def resident_mib(pid):
+    with open(f"/proc/{pid}/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("VmRSS:")) / 1024
+
+
+def huge(binary, folder, runs, simulated, spec):
+    """A job of very many runs: time until it is accepted, and the coordinator's memory while its first runs are
+    simulated. It is cancelled then."""
+    service = Service(binary, folder)
+    service.job({**spec, "runs": 200, "seed": 999})
+    before = resident_mib(service.process.pid)
+    begun = time.monotonic()
+    request = urllib.request.Request(
+        service.url + "/v1/jobs", json.dumps({**spec, "runs": runs}).encode(), {"content-type": "application/json"}
+    )
+    with urllib.request.urlopen(request) as answer:
+        job = json.load(answer)["job_id"]
+    accepted = time.monotonic() - begun
+    rows = []
+    for mark in [simulated * part // 5 for part in range(1, 6)]:
+        while (done := service.get(f"/v1/jobs/{job}")["progress"]["runs_done"]) < mark:
+            time.sleep(0.1)
+        rows.append((done, resident_mib(service.process.pid)))
+        print(rows[-1], flush=True)
+    urllib.request.urlopen(urllib.request.Request(f"{service.url}/v1/jobs/{job}/cancel", b"", method="POST")).close()
+    service.stop()
+    text = [f"A job of {runs:,} runs is accepted within {accepted * 1e3:.0f} ms. Memory of its coordinator (resident; it writes the data set", "while the runs are simulated):", ""]
+    text += ["| runs simulated | before | " + " | ".join(f"{done:,}" for done, _ in rows) + " |", "|---|" + "---:|" * (len(rows) + 1)]
+    text += [f"| MiB | {before:.0f} | " + " | ".join(f"{mib:.0f}" for _, mib in rows) + " |", ""]
+    return text
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--binary", default="target/release/hydroflex")
     parser.add_argument("--runs", type=int, nargs="*", default=[2560, 20480])
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--huge", type=int, default=10_000_000, help="runs of the job whose coordinator's memory is looked at; 0 for none")
+    parser.add_argument("--huge-simulated", type=int, default=100_000, help="runs of it that are simulated; 40 kB of disk each")
     parser.add_argument("--out")
     arguments = parser.parse_args()
     binary = os.path.abspath(arguments.binary)
@@ -171,6 +205,9 @@ def main():
         of = lambda key: statistics.median(spent[key] / n for n, spent in spent_rows if n == runs) * 1e3
         text.append(f"| {runs} | {of('simulate_s'):.3f} ms | {of('encode_s'):.3f} ms | {of('put_s'):.3f} ms | {of('wait_s'):.3f} ms |")
     text += ["", f"On disk a float64 sample takes {size['parquet']:.2f} bytes in the published Parquet files ({size['channels']} channels), {size['pickle']:.2f} in a pickle of", "NumPy arrays as the published scripts keep them.", ""]
+    if arguments.huge:
+        with tempfile.TemporaryDirectory() as folder:
+            text += huge(binary, folder, arguments.huge, arguments.huge_simulated, spec)
     text = "\n".join(text)
     print(text)
     if arguments.out:

@@ -2,7 +2,7 @@
 
 use crate::machines::ReadyMachine;
 use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
-use hydroflex_openapi::job::JobSpec;
+use hydroflex_openapi::job::{JobSpec, RunFlag};
 use hydroflex_sim::scenario::{self, ScenarioError};
 use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
 
@@ -49,49 +49,66 @@ impl PlannedRun {
 
     /// The record of a simulated run.
     fn ended(self, result: Result<Trajectory, RunFailure>) -> RunRecord {
-        match result {
-            Ok(trajectory) => {
-                let statistics = RunStatistics {
-                    steps: trajectory.statistics.steps,
-                    rejected: trajectory.statistics.rejected,
-                    iterations: trajectory.statistics.iterations,
-                    factorisations: trajectory.statistics.factorisations,
-                };
-                let samples = RunSamples {
-                    sample_count: trajectory.sample_count,
-                    columns: trajectory.columns,
-                };
-                self.record(RunOutcome::Ok(samples), trajectory.flags, statistics)
-            }
-            Err(failure) => self.failed(failure.to_string()),
-        }
+        self.record(result.into())
     }
 
     /// The record of a run without samples.
     #[must_use]
     pub fn failed(self, reason: String) -> RunRecord {
-        self.record(
-            RunOutcome::Failed { reason },
-            Vec::new(),
-            RunStatistics::default(),
-        )
+        self.record(Ended::failed(reason))
     }
 
-    fn record(
-        self,
-        outcome: RunOutcome,
-        flags: Vec<hydroflex_openapi::job::RunFlag>,
-        statistics: RunStatistics,
-    ) -> RunRecord {
+    fn record(self, ended: Ended) -> RunRecord {
         RunRecord {
             kind: self.kind,
             run_id: self.input.run_id,
             seed: Some(self.seed),
             payload_kg: self.input.payload_kg,
             angles_rad: self.input.angles_rad,
-            outcome,
-            flags,
-            statistics,
+            outcome: ended.outcome,
+            flags: ended.flags,
+            statistics: ended.statistics,
+        }
+    }
+}
+
+/// What a record says of how a run ended.
+pub struct Ended {
+    /// Samples, or the reason why there are none.
+    pub outcome: RunOutcome,
+    /// What it met on its way.
+    pub flags: Vec<RunFlag>,
+    /// Cost.
+    pub statistics: RunStatistics,
+}
+
+impl Ended {
+    fn failed(reason: String) -> Self {
+        Self {
+            outcome: RunOutcome::Failed { reason },
+            flags: Vec::new(),
+            statistics: RunStatistics::default(),
+        }
+    }
+}
+
+impl From<Result<Trajectory, RunFailure>> for Ended {
+    fn from(result: Result<Trajectory, RunFailure>) -> Self {
+        match result {
+            Ok(trajectory) => Self {
+                statistics: RunStatistics {
+                    steps: trajectory.statistics.steps,
+                    rejected: trajectory.statistics.rejected,
+                    iterations: trajectory.statistics.iterations,
+                    factorisations: trajectory.statistics.factorisations,
+                },
+                outcome: RunOutcome::Ok(RunSamples {
+                    sample_count: trajectory.sample_count,
+                    columns: trajectory.columns,
+                }),
+                flags: trajectory.flags,
+            },
+            Err(failure) => Self::failed(failure.to_string()),
         }
     }
 }

@@ -16,6 +16,7 @@ pub mod statistics;
 pub mod window;
 pub mod sink;
 pub mod publish;
+mod sample_file;
 pub mod runs_table;
 pub mod card;
 pub mod croissant;

@@ -12,7 +12,8 @@
 use crate::cut::{self, Cutter};
 use crate::record::{RunKind, RunRecord, RunSamples};
 use crate::runs_table::{RunPlace, RunsTable};
-use crate::samples::{SampleBatch, bytes_per_row, sample_properties, sample_schema};
+use crate::sample_file::{Encoders, SampleFile};
+use crate::samples::{SampleBatch, bytes_per_row};
 use crate::shard::{ShardError, ShardSchema, check_shape};
 use crate::sink::{Sink, SinkFile};
 use crate::statistics::Accumulator;
@@ -25,12 +26,12 @@ use hydroflex_openapi::dataset::{
     RunCounts, SplitName, WindowFacts,
 };
 use hydroflex_openapi::job::{JobSpec, RunStatus, SampleType, Split};
-use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
+use std::thread::JoinHandle;
 
 /// What is published: everything that decides the bytes beside the runs themselves.
 #[derive(Debug, Clone, PartialEq)]
@@ -189,6 +190,9 @@ pub enum PublishError {
         /// Value.
         value: f64,
     },
+    /// Threads that encode cannot be started.
+    #[error("threads that encode cannot be started")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
     /// A JSON document cannot be written.
     #[error("{path} cannot be serialised")]
     Json {
@@ -234,6 +238,9 @@ pub struct Publisher<S: Sink> {
 struct Output<S: Sink> {
     sink: S,
     files: Vec<ManifestFile>,
+    encoders: Encoders,
+    /// Files of samples on their way to the disk.
+    syncing: Vec<(String, JoinHandle<io::Result<()>>)>,
 }
 
 /// Files of one part of the data set.
@@ -248,15 +255,14 @@ struct Part {
 struct OpenFile {
     number: u32,
     planned_group: u32,
-    written_groups: u32,
-    writer: ArrowWriter<HashingFile>,
+    writer: SampleFile,
     rows: u64,
 }
 
 struct Settling {
     batch: SampleBatch,
     next_run_id: u64,
-    writer: Option<ArrowWriter<HashingFile>>,
+    writer: Option<SampleFile>,
     rows: u64,
     windows: WindowCollector,
 }
@@ -264,6 +270,17 @@ struct Settling {
 const SETTLING_PATH: &str = "meta/settling.parquet";
 
 impl<S: Sink> Publisher<S> {
+    /// Starts a data set; `encoders` threads encode its samples beside the caller's, which encodes them itself
+    /// if there are none. The bytes are the same.
+    ///
+    /// # Errors
+    /// The sink reports one, or the threads cannot be started.
+    pub fn with_encoders(spec: PublishSpec, sink: S, encoders: usize) -> Result<Self, PublishError> {
+        let mut publisher = Self::new(spec, sink)?;
+        publisher.output.encoders = Encoders::new(encoders)?;
+        Ok(publisher)
+    }
+
     /// Starts a data set.
     ///
     /// # Errors
@@ -277,6 +294,8 @@ impl<S: Sink> Publisher<S> {
             output: Output {
                 sink,
                 files: Vec::new(),
+                encoders: Encoders::new(0)?,
+                syncing: Vec::new(),
             },
             parts,
             runs_table,
@@ -397,13 +416,13 @@ impl<S: Sink> Publisher<S> {
 
     fn flush_settling(&mut self) -> Result<(), PublishError> {
         if self.settling.writer.is_none() {
-            let writer = create_samples(SETTLING_PATH, &self.spec, &mut self.output.sink)?;
+            let writer = SampleFile::create(SETTLING_PATH, &self.spec, &mut self.output.sink)?;
             self.settling.writer = Some(writer);
         }
-        if let Some(writer) = &mut self.settling.writer {
-            write_group(SETTLING_PATH, writer, &mut self.settling.batch)?;
+        match &mut self.settling.writer {
+            Some(writer) => writer.push_group(&mut self.settling.batch, &self.output.encoders),
+            None => Ok(()), // made above
         }
-        Ok(())
     }
 
     /// Writes what is left and everything that describes the data set.
@@ -433,12 +452,11 @@ impl<S: Sink> Publisher<S> {
             ..
         } = self;
         for part in parts.values_mut() {
-            part.close(&mut output.files)?;
+            part.close(&mut output)?;
         }
         output.files.push(runs_table.finish()?);
         if let Some(writer) = settling.writer {
-            let entry = close_samples(SETTLING_PATH, writer, settling.rows)?;
-            output.files.push(entry);
+            output.close_samples(writer, settling.rows)?;
             output.write_json("meta/window.json", &window)?;
         }
         output.write_json("meta/stats.json", &statistics)?;
@@ -466,6 +484,7 @@ impl<S: Sink> Publisher<S> {
             sums.extend([file.sha256.as_str(), "  ", file.path.as_str(), "\n"]);
         }
         output.write("SHA256SUMS", sums.as_bytes())?;
+        output.wait_for_disk()?;
         let published = Published {
             manifest,
             dataset_sha256: hex::encode(Sha256::digest(sums.as_bytes())),
@@ -506,6 +525,26 @@ impl<S: Sink> Output<S> {
         let mut file = HashingFile::create(path, &mut self.sink)?;
         file.write_all(bytes).map_err(sink_error(path))?;
         self.files.push(file.finish(path, None)?);
+        Ok(())
+    }
+
+    /// Ends a file of samples; it goes to the disk while the next one is written.
+    fn close_samples(&mut self, writer: SampleFile, rows: u64) -> Result<(), PublishError> {
+        let path = writer.path().to_owned();
+        let (entry, file) = writer.close()?.into_entry(&path, Some(rows));
+        self.files.push(entry);
+        self.syncing
+            .push((path, std::thread::spawn(move || file.finish())));
+        Ok(())
+    }
+
+    fn wait_for_disk(&mut self) -> Result<(), PublishError> {
+        for (path, syncing) in self.syncing.drain(..) {
+            let synced = syncing
+                .join()
+                .unwrap_or_else(|_| Err(io::Error::other("the thread that wrote it panicked")));
+            synced.map_err(sink_error(&path))?;
+        }
         Ok(())
     }
 
@@ -554,82 +593,44 @@ impl Part {
     ) -> Result<Option<RunPlace>, PublishError> {
         let place = self.cutter.place(planned_rows);
         if self.open.as_ref().is_some_and(|open| open.number != place.file) {
-            self.close(&mut output.files)?;
+            self.close(output)?;
         }
-        let path = cut::file_name(self.split, place.file, self.files);
         let mut open = match self.open.take() {
             Some(open) => open,
             None => OpenFile {
                 number: place.file,
                 planned_group: place.row_group,
-                written_groups: 0,
-                writer: create_samples(&path, spec, &mut output.sink)?,
+                writer: SampleFile::create(
+                    &cut::file_name(self.split, place.file, self.files),
+                    spec,
+                    &mut output.sink,
+                )?,
                 rows: 0,
             },
         };
         if open.planned_group != place.row_group {
             open.planned_group = place.row_group;
-            open.write_group(&path, &mut self.batch)?;
+            open.writer.push_group(&mut self.batch, &output.encoders)?;
         }
         let found = record.samples().map(|samples| {
             open.rows += samples.sample_count as u64;
             self.batch.push(record.run_id, samples);
             RunPlace {
-                file: path,
-                row_group: open.written_groups,
+                file: open.writer.path().to_owned(),
+                row_group: open.writer.groups(),
             }
         });
         self.open = Some(open);
         Ok(found)
     }
 
-    fn close(&mut self, files: &mut Vec<ManifestFile>) -> Result<(), PublishError> {
+    fn close<S: Sink>(&mut self, output: &mut Output<S>) -> Result<(), PublishError> {
         if let Some(mut open) = self.open.take() {
-            let path = cut::file_name(self.split, open.number, self.files);
-            open.write_group(&path, &mut self.batch)?;
-            files.push(close_samples(&path, open.writer, open.rows)?);
+            open.writer.push_group(&mut self.batch, &output.encoders)?;
+            output.close_samples(open.writer, open.rows)?;
         }
         Ok(())
     }
-}
-
-impl OpenFile {
-    fn write_group(&mut self, path: &str, batch: &mut SampleBatch) -> Result<(), PublishError> {
-        if batch.rows() > 0 {
-            write_group(path, &mut self.writer, batch)?;
-            self.written_groups += 1;
-        }
-        Ok(())
-    }
-}
-
-fn create_samples<S: Sink>(
-    path: &str,
-    spec: &PublishSpec,
-    sink: &mut S,
-) -> Result<ArrowWriter<HashingFile>, PublishError> {
-    let properties = sample_properties(spec).map_err(parquet_error(path))?;
-    let schema = sample_schema(&spec.channels, spec.sample_type);
-    let file = HashingFile::create(path, sink)?;
-    ArrowWriter::try_new(file, schema, Some(properties)).map_err(parquet_error(path))
-}
-
-fn write_group(
-    path: &str,
-    writer: &mut ArrowWriter<HashingFile>,
-    batch: &mut SampleBatch,
-) -> Result<(), PublishError> {
-    writer.write(&batch.take()?).map_err(parquet_error(path))?;
-    writer.flush().map_err(parquet_error(path))
-}
-
-fn close_samples(
-    path: &str,
-    writer: ArrowWriter<HashingFile>,
-    rows: u64,
-) -> Result<ManifestFile, PublishError> {
-    let file = writer.into_inner().map_err(parquet_error(path))?;
-    file.finish(path, Some(rows))
 }
 
 pub(crate) fn parquet_error(path: &str) -> impl Fn(ParquetError) -> PublishError + use<> {
@@ -691,13 +692,20 @@ impl HashingFile {
     }
 
     pub(crate) fn finish(self, path: &str, rows: Option<u64>) -> Result<ManifestFile, PublishError> {
-        self.file.finish().map_err(sink_error(path))?;
-        Ok(ManifestFile {
+        let (entry, file) = self.into_entry(path, rows);
+        file.finish().map_err(sink_error(path))?;
+        Ok(entry)
+    }
+
+    /// The entry of a file that is written whole, and the file, which is not yet on the disk.
+    fn into_entry(self, path: &str, rows: Option<u64>) -> (ManifestFile, Box<dyn SinkFile>) {
+        let entry = ManifestFile {
             path: path.to_owned(),
             bytes: self.bytes,
             sha256: hex::encode(self.hash.finalize()),
             rows,
-        })
+        };
+        (entry, self.file)
     }
 }
 

@@ -198,13 +198,18 @@ impl SampleBatch {
         reason = "rounding to the nearest 32-bit float is what the job asked for"
     )]
     pub fn take(&mut self) -> Result<RecordBatch, ArrowError> {
+        // The next row group will be as large.
+        fn taken<T>(column: &mut Vec<T>) -> Vec<T> {
+            let next = Vec::with_capacity(column.len());
+            std::mem::replace(column, next)
+        }
         let mut arrays: Vec<ArrayRef> = vec![
-            Arc::new(UInt64Array::from(std::mem::take(&mut self.run_id))),
-            Arc::new(Int32Array::from(std::mem::take(&mut self.step))),
-            Arc::new(Float64Array::from(std::mem::take(&mut self.time_s))),
+            Arc::new(UInt64Array::from(taken(&mut self.run_id))),
+            Arc::new(Int32Array::from(taken(&mut self.step))),
+            Arc::new(Float64Array::from(taken(&mut self.time_s))),
         ];
         for column in &mut self.columns {
-            let values = std::mem::take(column);
+            let values = taken(column);
             arrays.push(match self.sample_type {
                 SampleType::Float64 => Arc::new(Float64Array::from(values)),
                 SampleType::Float32 => Arc::new(Float32Array::from_iter_values(

@@ -36,9 +36,14 @@ fn records(runs: u64, steps: usize) -> Vec<RunRecord> {
 
 /// Through shards that end after the given numbers of records.
 fn publish(json: &str, records: &[RunRecord], cuts: &[usize]) -> (Published, Files) {
+    publish_on(0, json, records, cuts)
+}
+
+/// The same, with this many threads that encode.
+fn publish_on(encoders: usize, json: &str, records: &[RunRecord], cuts: &[usize]) -> (Published, Files) {
     let spec = publish_spec(job(json));
     let schema = spec.shard_schema();
-    let mut publisher = Publisher::new(spec, MemorySink::default()).unwrap();
+    let mut publisher = Publisher::with_encoders(spec, MemorySink::default(), encoders).unwrap();
     let mut rest = records;
     for &cut in cuts.iter().chain([&usize::MAX]) {
         let (shard, later) = rest.split_at(cut.min(rest.len()));
@@ -197,6 +202,25 @@ fn nothing_in_the_files_but_what_was_asked_for() {
     // seed and title are part of what was asked for
     let (other, _) = publish(r#"{"runs": 12, "duration_s": 0.1, "seed": 1}"#, &records, &[]);
     assert_ne!(first.dataset_sha256, other.dataset_sha256);
+}
+
+#[test]
+fn same_bytes_for_any_number_of_encoders() {
+    // Two files of training runs, several row groups each, and a settling file beside them.
+    let records = records(900, 60);
+    let json = r#"{"runs": 900, "seed": 3, "duration_s": 0.3, "settling_runs": 2, "file_size_mb": 1,
+        "split": {"train": 0.7, "validation": 0.2, "test": 0.1}}"#;
+    let (published, files) = publish(json, &records, &[400]);
+    assert!(
+        files.contains_key("data/train-00002-of-00003.parquet"),
+        "{:?}",
+        files.keys()
+    );
+    for encoders in [1, 3] {
+        let (other, other_files) = publish_on(encoders, json, &records, &[17]);
+        assert_eq!(other, published);
+        assert!(other_files == files, "{encoders} encoders");
+    }
 }
 
 proptest! {

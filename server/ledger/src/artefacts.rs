@@ -3,6 +3,7 @@
 use crate::engine::{Engine, Transaction, values};
 use crate::events::append;
 use crate::jobs::{IdempotencyKey, advance, claim_key};
+use crate::orphans::forget;
 use crate::record::{DatasetRecord, ModelRecord, TrainingRecord};
 use crate::transition::ATTEMPT_LIMIT;
 use crate::{Created, Ledger, LedgerError, clock};
@@ -145,6 +146,7 @@ impl Ledger {
             ],
         )
         .await?;
+        forget(&mut tx, &dataset.id).await?;
         let event = EventKind::Dataset {
             dataset_id: dataset.id.clone(),
             dataset_sha256: dataset.sha256.clone(),

@@ -252,6 +252,28 @@ impl Blobs {
         Ok(())
     }
 
+    /// As [`Blobs::upload`] for a file that is on the disk already and that nobody needs afterwards: a
+    /// directory on the same file system takes the file itself.
+    ///
+    /// # Errors
+    /// As [`Blobs::upload`].
+    pub async fn adopt(&self, file: &Path, key: &str) -> Result<(), BlobError> {
+        if let Some(target) = self.local_path(key) {
+            let (from, to) = (file.to_owned(), target.clone());
+            let moved = tokio::task::spawn_blocking(move || move_durably(&from, &to))
+                .await
+                .unwrap_or_else(|panic| Err(std::io::Error::other(panic)));
+            match moved {
+                Ok(()) => return Ok(()),
+                Err(error) if error.kind() == std::io::ErrorKind::CrossesDevices => {}
+                Err(source) => {
+                    return Err(BlobError::File { path: target, source });
+                }
+            }
+        }
+        self.upload(file, key).await
+    }
+
     /// Reads a whole object and checks its hash.
     ///
     /// # Errors
@@ -356,6 +378,23 @@ impl Blobs {
         Ok(deleted)
     }
 
+    /// Removes the folders of a directory that deleted objects have left empty, and the folder of the key with
+    /// them; object stores have none.
+    pub fn remove_empty_folders(&self, key: &str) {
+        fn remove(folder: &Path) {
+            for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+                if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                    remove(&entry.path());
+                }
+            }
+            // One that is not empty stays, and so does what is put into it meanwhile.
+            let _ = std::fs::remove_dir(folder);
+        }
+        if let Some(path) = self.local_path(key) {
+            remove(&path);
+        }
+    }
+
     /// Names of the folders directly below a key.
     ///
     /// # Errors
@@ -386,4 +425,18 @@ impl Blobs {
         keys.sort();
         Ok(keys)
     }
+}
+
+/// Moves a file within a file system, and makes its new name durable with every directory made for it.
+fn move_durably(from: &Path, to: &Path) -> std::io::Result<()> {
+    let parents: Vec<&Path> = to.ancestors().skip(1).collect();
+    let made = parents.iter().take_while(|parent| !parent.exists()).count();
+    if let Some(parent) = to.parent() {
+        std::fs::create_dir_all(parent)?;
+    }
+    std::fs::rename(from, to)?;
+    for directory in parents.iter().take(made + 1) {
+        std::fs::File::open(directory)?.sync_all()?;
+    }
+    Ok(())
 }

@@ -21,6 +21,7 @@ mod jobs;
 mod shards;
 mod workers;
 mod artefacts;
+pub mod orphans;
 mod aliases;
 mod events;
 pub mod keys;
@@ -43,11 +44,12 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 4] = [
+const SCHEMA: [&str; 5] = [
     include_str!("../migrations/0001_ledger.sql"),
     include_str!("../migrations/0002_aliases.sql"),
     include_str!("../migrations/0003_keys.sql"),
     include_str!("../migrations/0004_instruction_sets.sql"),
+    include_str!("../migrations/0005_uploads.sql"),
 ];
 
 /// The shared record of what is to be done and what is done.

@@ -450,7 +450,7 @@ impl Ledger {
     }
 
     /// Has a committed shard done again, because its object is missing or damaged. Its job waits in
-    /// `publishing` until it is complete again. False if somebody else has done so.
+    /// its state until it is complete again. False if somebody else has done so.
     ///
     /// # Errors
     /// Passes on what the database says.
@@ -470,11 +470,11 @@ impl Ledger {
         let statement = match shard.kind {
             ShardKind::Runs => {
                 "UPDATE jobs SET runs_done = runs_done - $2, runs_failed = runs_failed - $3 \
-                 WHERE id = $1 AND state = 'publishing'"
+                 WHERE id = $1 AND state IN ('simulating', 'publishing')"
             }
             ShardKind::Settling => {
                 "UPDATE jobs SET settling_done = settling_done - $2, runs_failed = runs_failed - 0 * $3 \
-                 WHERE id = $1 AND state = 'publishing'"
+                 WHERE id = $1 AND state IN ('simulating', 'publishing')"
             }
         };
         let values = values![

@@ -3,15 +3,13 @@
 pub(crate) mod run_table;
 
 use anyhow::{Context, bail, ensure};
-use hydroflex_dataset::{
-    DirectorySink, PublishSpec, Published, Publisher, RunKind, RunLengths, RunOutcome, RunRecord, RunSamples,
-    RunStatistics,
-};
+use hydroflex_dataset::{DirectorySink, PublishSpec, Published, Publisher, RunKind, RunLengths, RunRecord};
 use hydroflex_openapi::dataset::{CodeFacts, DatasetSource, MachineFacts};
 use hydroflex_openapi::job::{Integrator, SampleType, Split};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
+use hydroflex_worker::run::Ended;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -73,6 +71,8 @@ const DEFAULT_STEP_S: f64 = 0.005;
 /// Runs simulated between two visits to the writer, per thread; also bounded by their samples.
 const CHUNK_RUNS_PER_THREAD: usize = 16;
 const CHUNK_SAMPLES: usize = 200_000;
+/// Threads that encode, at most.
+const MOST_ENCODERS: usize = 8;
 
 /// Runs the command.
 ///
@@ -98,7 +98,12 @@ pub fn run(args: Args) -> anyhow::Result<()> {
     }
 
     let bar = progress_bar(runs.len());
-    let mut publisher = Publisher::new(spec, sink)?;
+    // One thread writes beside one that simulates; beside several it would be the slowest.
+    let encoders = match pool.current_num_threads() {
+        1 => 0,
+        threads => threads.min(MOST_ENCODERS),
+    };
+    let mut publisher = Publisher::with_encoders(spec, sink, encoders)?;
     let (sender, receiver) = mpsc::sync_channel::<Vec<RunRecord>>(1);
     std::thread::scope(|scope| {
         // one chunk is simulated while the one before it is written
@@ -242,38 +247,16 @@ fn simulate(
 }
 
 fn record(run: &RunInput, result: Result<Trajectory, RunFailure>) -> RunRecord {
-    let (outcome, flags, statistics) = match result {
-        Ok(trajectory) => {
-            let statistics = RunStatistics {
-                steps: trajectory.statistics.steps,
-                rejected: trajectory.statistics.rejected,
-                iterations: trajectory.statistics.iterations,
-                factorisations: trajectory.statistics.factorisations,
-            };
-            let samples = RunSamples {
-                sample_count: trajectory.sample_count,
-                columns: trajectory.columns,
-            };
-            (RunOutcome::Ok(samples), trajectory.flags, statistics)
-        }
-        Err(failure) => {
-            let reason = failure.to_string();
-            (
-                RunOutcome::Failed { reason },
-                Vec::new(),
-                RunStatistics::default(),
-            )
-        }
-    };
+    let ended = Ended::from(result);
     RunRecord {
         kind: RunKind::Job,
         run_id: run.run_id,
         seed: None,
         payload_kg: run.payload_kg,
         angles_rad: run.angles_rad.clone(),
-        outcome,
-        flags,
-        statistics,
+        outcome: ended.outcome,
+        flags: ended.flags,
+        statistics: ended.statistics,
     }
 }
 

@@ -12,6 +12,7 @@ pub mod watch;
 
 use crate::http::error::ApiError;
 use hydroflex_ledger::blobs::Blobs;
+use hydroflex_ledger::orphans::Orphans;
 use hydroflex_ledger::{JobRecord, Ledger, LedgerError, NewJob, ShardKind};
 use hydroflex_openapi::catalogue::MachineInfo;
 use hydroflex_openapi::id::{DatasetId, JobId};
@@ -31,11 +32,13 @@ use watch::Watch;
 /// How often the ledger is looked at while a job is unfinished: a few reads of a local file, against
 /// workers that wait for their next shard.
 const BUSY_TICK: Duration = Duration::from_millis(50);
-/// How often objects are looked for that a worker put after its job was over and cleaned up: rare, and
-/// in nobody's way.
+/// How often objects are looked for that nothing names: rare, and in nobody's way.
 const SWEEP: Duration = Duration::from_mins(1);
 /// And when there is none; whoever accepts a job calls.
 const IDLE_TICK: Duration = Duration::from_millis(500);
+/// Jobs whose data sets are written at a time while their runs are still simulated: each has the memory of
+/// a few row groups and files of its own.
+const MOST_EARLY: usize = 2;
 
 /// Where a coordinator keeps things, and how patient it is.
 #[derive(Debug, Clone)]
@@ -50,6 +53,8 @@ pub struct CoordinatorConfig {
     pub lease: Duration,
     /// Unfinished jobs above which no more are accepted.
     pub most_jobs: u64,
+    /// Time after which objects of no data set may be deleted.
+    pub orphan_grace: Duration,
 }
 
 /// The coordinator; clones are handles on one.
@@ -197,12 +202,18 @@ impl Coordinator {
     pub async fn run(self, stop: CancellationToken) {
         let mut watch = Watch::new(self.config().lease);
         let mut tasks = tokio::task::JoinSet::new();
+        let mut orphans = Orphans::new(self.config().orphan_grace);
         let mut swept: Option<Instant> = None;
         self.clear_scratch();
         loop {
             if swept.is_none_or(|at| at.elapsed() > SWEEP) {
-                match self.sweep().await {
-                    Ok(()) => swept = Some(Instant::now()),
+                match orphans.sweep(self.ledger(), self.blobs()).await {
+                    Ok(deleted) => {
+                        swept = Some(Instant::now());
+                        if deleted > 0 {
+                            tracing::info!(deleted, "orphans deleted");
+                        }
+                    }
                     Err(error) => tracing::debug!(%error, "orphans could not be looked for; trying again"),
                 }
             }
@@ -262,7 +273,13 @@ impl Coordinator {
                 );
             }
             match job.state {
-                JobState::Queued | JobState::Simulating => self.advance(&job, workers).await?,
+                JobState::Queued => self.advance(&job, workers).await?,
+                JobState::Simulating => {
+                    self.advance(&job, workers).await?;
+                    if self.publishes_fewer_than(MOST_EARLY) {
+                        self.publish_in_background(job, tasks);
+                    }
+                }
                 // Incomplete again if an object turned out damaged and its shard is done anew.
                 JobState::Publishing if job.is_complete() => self.publish_in_background(job, tasks),
                 _ => {}
@@ -277,21 +294,6 @@ impl Coordinator {
             }
         }
         Ok(busy)
-    }
-
-    /// Deletes what late workers put for jobs whose objects have been deleted already.
-    async fn sweep(&self) -> anyhow::Result<()> {
-        for name in self.blobs().folders("shards").await? {
-            // What is not ours is not touched.
-            let Ok(job) = name.parse::<JobId>() else { continue };
-            if self.ledger().is_collected(job).await? {
-                let deleted = self.blobs().delete_below(&format!("shards/{job}")).await?;
-                if deleted > 0 {
-                    tracing::info!(%job, deleted, "orphans deleted");
-                }
-            }
-        }
-        Ok(())
     }
 
     /// Workers that simulate; the configured number while none has reported.
@@ -339,6 +341,13 @@ impl Coordinator {
                 .await?;
         }
         Ok(())
+    }
+
+    fn publishes_fewer_than(&self, most: usize) -> bool {
+        self.0
+            .publishing
+            .lock()
+            .is_ok_and(|publishing| publishing.len() < most)
     }
 
     fn publish_in_background(&self, job: JobRecord, tasks: &mut tokio::task::JoinSet<()>) {

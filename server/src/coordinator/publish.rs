@@ -4,8 +4,9 @@
 //! shards in run order ──► scratch directory ──► datasets/ID/… in the store ──► one transaction
 //! ```
 //!
-//! A death anywhere before the transaction leaves nothing that a reader could see; the next attempt
-//! writes the same bytes under the same names.
+//! The scratch directory fills while later runs are still simulated. A death anywhere before the
+//! transaction leaves nothing that a reader could see; the next attempt writes the same bytes under the
+//! same names.
 
 use super::Coordinator;
 use super::machines::CheckedMachine;
@@ -23,14 +24,21 @@ use hydroflex_sim::scenario::ScenarioError;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::mpsc;
 
 /// Reason in the data set of a run that killed every worker that tried it. The real reasons name
 /// processes and times; they are in the job's events, because a data set holds neither.
 const GIVEN_UP: &str = "given up: every attempt ended with the worker's failure";
 
-/// Shards read ahead of the writer.
-const READ_AHEAD: usize = 4;
+/// Shards that wait for the writer, beside the one that is read: they may have 64 MiB each.
+const READ_AHEAD: usize = 1;
+
+/// How often the ledger is asked for the next shard while it is still simulated.
+const POLL: Duration = Duration::from_millis(20);
+
+/// Threads that encode, at most: so many that reading and hashing, which one thread does, takes as long.
+const MOST_ENCODERS: usize = 8;
 
 /// Why a data set was not published.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +81,9 @@ pub enum PublishFailure {
         /// Runs of the job.
         expected: u64,
     },
+    /// The job was ended by somebody else.
+    #[error("the job is over")]
+    Over,
     /// A run that was given up cannot be planned.
     #[error(transparent)]
     Plan(#[from] ScenarioError),
@@ -113,11 +124,23 @@ enum Feed {
     GivenUp { kind: RunKind, run_id: u64 },
 }
 
-/// Publishes the data set of a job whose every run is accounted for.
+/// Publishes the data set of a job that has been begun: writes what is simulated, waits for the rest.
 ///
 /// # Errors
 /// See [`PublishFailure`].
 pub async fn publish(coordinator: &Coordinator, job: &JobRecord) -> Result<(), PublishFailure> {
+    match publish_if_wanted(coordinator, job).await {
+        Err(PublishFailure::Over) => Ok(()),
+        // The shards of a job that is over are deleted.
+        Err(error) => match coordinator.ledger().job(job.id).await {
+            Ok(Some(now)) if now.state.is_final() => Ok(()),
+            _ => Err(error),
+        },
+        Ok(()) => Ok(()),
+    }
+}
+
+async fn publish_if_wanted(coordinator: &Coordinator, job: &JobRecord) -> Result<(), PublishFailure> {
     let machine = coordinator
         .machine(&job.spec)
         .await
@@ -130,6 +153,7 @@ pub async fn publish(coordinator: &Coordinator, job: &JobRecord) -> Result<(), P
     }
     let scratch = Scratch::new(&coordinator.config().scratch, job)?;
     let published = write(coordinator, job, machine, &scratch.target()).await?;
+    coordinator.ledger().begin_publishing(job.id).await?;
     crash_point("publish-written");
     let id = DatasetId::of_sha256(&published.dataset_sha256)?;
     let files: Vec<FileEntry> = published
@@ -141,11 +165,13 @@ pub async fn publish(coordinator: &Coordinator, job: &JobRecord) -> Result<(), P
             sha256: file.sha256.clone(),
         })
         .collect();
+    // From here on until the job is over, what lies under the data set's name is no orphan.
+    coordinator.ledger().announce_upload(job.id, &id).await?;
     for (number, file) in files.iter().enumerate() {
         let key = format!("datasets/{id}/{}", file.path);
         coordinator
             .blobs()
-            .upload(&scratch.target().join(&file.path), &key)
+            .adopt(&scratch.target().join(&file.path), &key)
             .await?;
         if number == 0 {
             crash_point("publish-upload");
@@ -189,7 +215,8 @@ async fn write(
             path: target.clone(),
             source,
         })?;
-        let publisher = Publisher::new(machine.publish_spec(spec.clone(), &level), sink)?;
+        let publisher =
+            Publisher::with_encoders(machine.publish_spec(spec.clone(), &level), sink, encoders())?;
         let (published, sink) = consume(receiver, publisher, &spec, &machine)?;
         sink.commit()
             .map_err(|source| PublishFailure::Scratch { path: target, source })?;
@@ -228,7 +255,12 @@ async fn write(
     }
 }
 
-/// Sends the shards of one kind in run order. False if the writer hung up.
+/// Threads that encode beside the one that reads.
+fn encoders() -> usize {
+    std::thread::available_parallelism().map_or(1, |cores| cores.get().min(MOST_ENCODERS))
+}
+
+/// Sends the shards of one kind in run order, as they are settled. False if the writer hung up.
 async fn feed(
     coordinator: &Coordinator,
     job: &JobRecord,
@@ -237,7 +269,15 @@ async fn feed(
     sender: &mpsc::Sender<Feed>,
 ) -> Result<bool, PublishFailure> {
     let mut next = 0;
-    loop {
+    while next < expected {
+        // Asked before the shards are: a job that was complete then has them all.
+        let Some(now) = coordinator.ledger().job(job.id).await? else {
+            return Err(PublishFailure::Over);
+        };
+        if now.state.is_final() {
+            return Err(PublishFailure::Over);
+        }
+        let before = next;
         let shards = coordinator
             .ledger()
             .settled_shards(job.id, kind, next, 64)
@@ -252,20 +292,21 @@ async fn feed(
             }
             next += shard.run_count;
         }
-        if next == expected {
-            return Ok(true);
-        }
-        if shards
-            .last()
-            .is_none_or(|last| last.first_run + last.run_count != next)
-        {
-            return Err(PublishFailure::Uncovered {
-                kind,
-                found: next,
-                expected,
-            });
+        if next == before {
+            if now.is_complete() {
+                return Err(PublishFailure::Uncovered {
+                    kind,
+                    found: next,
+                    expected,
+                });
+            }
+            if sender.is_closed() {
+                return Ok(false);
+            }
+            tokio::time::sleep(POLL).await;
         }
     }
+    Ok(true)
 }
 
 async fn fetch(coordinator: &Coordinator, shard: &ShardRecord) -> Result<Feed, PublishFailure> {

@@ -196,6 +196,25 @@ impl<S: Send + Sync> FromRequestParts<S> for Page {
 }
 
 impl Page {
+    /// Entries to ask for: one more says whether there is another page.
+    #[must_use]
+    pub fn ask(&self) -> u64 {
+        self.limit + 1
+    }
+
+    /// Cuts what was asked for to the page; the cursor of the next one, if there is one, names its last entry.
+    pub fn cut<T, C: ToString>(
+        &self,
+        records: &mut Vec<T>,
+        cursor_of: impl FnOnce(&T) -> C,
+    ) -> Option<String> {
+        let limit = usize::try_from(self.limit).unwrap_or(usize::MAX);
+        let more = records.len() > limit;
+        records.truncate(limit);
+        let last = records.last().filter(|_| more)?;
+        Some(cursor_of(last).to_string())
+    }
+
     /// The cursor in its own type.
     ///
     /// # Errors
@@ -242,6 +261,16 @@ impl FromStr for TimeCursor {
             })
         } else {
             Err(())
+        }
+    }
+}
+
+impl TimeCursor {
+    /// The cursor of an entry.
+    pub fn new(ms: i64, id: &impl ToString) -> Self {
+        Self {
+            ms,
+            id: id.to_string(),
         }
     }
 }

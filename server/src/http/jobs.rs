@@ -70,12 +70,8 @@ pub async fn submit(
     ),
 )]
 pub async fn list(State(state): State<AppState>, page: Page) -> Result<Json<JobPage>, ApiError> {
-    let mut records = state.ledger().jobs(page.after()?, page.limit + 1).await?;
-    let more = records.len() as u64 > page.limit;
-    records.truncate(usize::try_from(page.limit).unwrap_or(usize::MAX));
-    let next_cursor = more
-        .then(|| records.last().map(|job| job.id.to_string()))
-        .flatten();
+    let mut records = state.ledger().jobs(page.after()?, page.ask()).await?;
+    let next_cursor = page.cut(&mut records, |last| last.id);
     let mut jobs = Vec::with_capacity(records.len());
     for record in records {
         jobs.push(status_of(state.ledger(), record).await?);

@@ -24,16 +24,8 @@ use hydroflex_openapi::problem::Problem;
 pub async fn list(State(state): State<AppState>, page: Page) -> Result<Json<ModelPage>, ApiError> {
     let after: Option<TimeCursor> = page.after()?;
     let before = after.as_ref().map(|cursor| (cursor.ms, cursor.id.as_str()));
-    let mut records = state.ledger().models(before, page.limit + 1).await?;
-    let more = records.len() as u64 > page.limit;
-    records.truncate(usize::try_from(page.limit).unwrap_or(usize::MAX));
-    let next_cursor = records.last().filter(|_| more).map(|last| {
-        TimeCursor {
-            ms: last.created_ms,
-            id: last.id.to_string(),
-        }
-        .to_string()
-    });
+    let mut records = state.ledger().models(before, page.ask()).await?;
+    let next_cursor = page.cut(&mut records, |last| TimeCursor::new(last.created_ms, &last.id));
     Ok(Json(ModelPage {
         models: records.iter().map(ModelRecord::info).collect(),
         next_cursor,

@@ -58,6 +58,7 @@ impl Desk {
             workers: 2,
             lease: Duration::from_secs(10),
             most_jobs,
+            orphan_grace: Duration::from_mins(10),
         };
         let coordinator = Coordinator::new(ledger.clone(), blobs.clone(), config);
         let state = change(AppState::new(coordinator));

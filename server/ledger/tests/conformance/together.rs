@@ -1,11 +1,14 @@
 //! Ledger and blobs together, and a full disk below both.
 
-use crate::{new_job, result, sha256, sqlite};
+use crate::{finish_runs, new_dataset, new_job, result, sha256, sqlite};
 use bytes::Bytes;
 use hydroflex_ledger::blobs::Blobs;
-use hydroflex_ledger::{CommitOutcome, Ledger, ShardKind, ShardResult};
+use hydroflex_ledger::orphans::Orphans;
+use hydroflex_ledger::{CommitOutcome, Ledger, NewDataset, ShardKind, ShardResult};
+use hydroflex_openapi::id::DatasetId;
+use std::time::Duration;
 
-on_every_pair![from_claim_to_collection];
+on_every_pair![from_claim_to_collection, what_nobody_publishes_is_deleted];
 
 async fn from_claim_to_collection(ledger: &Ledger, blobs: &Blobs) {
     let id = ledger.create_job(&new_job(&[2, 2, 2]), None).await.unwrap().id();
@@ -51,6 +54,69 @@ async fn from_claim_to_collection(ledger: &Ledger, blobs: &Blobs) {
     assert_eq!(blobs.list(&below).await.unwrap(), Vec::<String>::new());
 }
 
+async fn what_nobody_publishes_is_deleted(ledger: &Ledger, blobs: &Blobs) {
+    // A name of its own for each pair: the ledgers and the stores are shared by all.
+    let unique = sha256(uuid_of(ledger, blobs).await.as_bytes());
+    let dataset = NewDataset {
+        id: DatasetId::of_sha256(&unique).unwrap(),
+        sha256: unique,
+        ..new_dataset()
+    };
+    let folder = format!("datasets/{}", dataset.id);
+    let put = async || {
+        for path in ["README.md", "data/train-00000-of-00001.parquet"] {
+            let _ = blobs
+                .create(&format!("{folder}/{path}"), Bytes::from_static(b"abc"))
+                .await;
+        }
+    };
+    let count = async || blobs.list(&folder).await.unwrap().len();
+    let mut hasty = Orphans::new(Duration::ZERO);
+
+    // Put by an attempt whose job is then cancelled: kept before, kept for the grace time, deleted after.
+    let cancelled = ledger.create_job(&new_job(&[2]), None).await.unwrap().id();
+    ledger.announce_upload(cancelled, &dataset.id).await.unwrap();
+    put().await;
+    hasty.sweep(ledger, blobs).await.unwrap();
+    assert_eq!(count().await, 2, "its job is not over");
+    ledger.cancel_job(cancelled).await.unwrap();
+    let mut patient = Orphans::new(Duration::from_hours(1));
+    patient.sweep(ledger, blobs).await.unwrap();
+    assert_eq!(count().await, 2, "a patient collector");
+    // Another job with the same data set comes just in time.
+    let twin = ledger.create_job(&new_job(&[2]), None).await.unwrap().id();
+    ledger.announce_upload(twin, &dataset.id).await.unwrap();
+    hasty.sweep(ledger, blobs).await.unwrap();
+    assert_eq!(count().await, 2, "the twin is not over");
+    ledger.cancel_job(twin).await.unwrap();
+    assert!(hasty.sweep(ledger, blobs).await.unwrap() >= 2);
+    assert_eq!(count().await, 0);
+    assert!(
+        !blobs
+            .folders("datasets")
+            .await
+            .unwrap()
+            .contains(&dataset.id.to_string())
+    );
+
+    // Published: never an orphan, whatever becomes of its job.
+    let job = ledger.create_job(&new_job(&[2]), None).await.unwrap().id();
+    finish_runs(ledger, job).await;
+    ledger.announce_upload(job, &dataset.id).await.unwrap();
+    put().await;
+    assert!(ledger.publish_dataset(job, &dataset, &[]).await.unwrap());
+    hasty.sweep(ledger, blobs).await.unwrap();
+    assert_eq!(count().await, 2);
+    assert!(ledger.abandoned(&dataset.id).await.unwrap().is_none());
+}
+
+/// A text that differs for every pair of ledger and store.
+async fn uuid_of(ledger: &Ledger, blobs: &Blobs) -> String {
+    let job = ledger.create_job(&new_job(&[1]), None).await.unwrap().id();
+    ledger.cancel_job(job).await.unwrap();
+    format!("{job} {}", blobs.local_path("").is_some())
+}
+
 /// SQLite ends a transaction by itself when the disk is full, and sqlx does not notice: once the disk has
 /// room again, no connection may be left that refuses to work.
 #[tokio::test(flavor = "multi_thread")]
@@ -63,7 +129,7 @@ async fn a_disk_that_was_full_spoils_no_connection() {
             .status();
         done.is_ok_and(|status| status.success())
     };
-    if !run("mount", &["-t", "tmpfs", "-o", "size=2m", "hydroflex-test"]) {
+    if !run("mount", &["-t", "tmpfs", "-o", "size=3m", "hydroflex-test"]) {
         eprintln!("only root can make a small disk: left out");
         return;
     }
