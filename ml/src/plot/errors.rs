@@ -215,6 +215,6 @@ mod tests {
             .collect();
         assert_eq!(at.len(), 3);
         assert!(at[0] < at[1] && at[1] < at[2], "{at:?}");
-        assert!(svg.contains(">0.00001<") && svg.contains(">1<"), "{svg}");
+        assert!(svg.contains(">0.00001<") && svg.contains(">0.1<"), "{svg}");
     }
 }
