@@ -130,13 +130,12 @@ enum Feed {
 /// See [`PublishFailure`].
 pub async fn publish(coordinator: &Coordinator, job: &JobRecord) -> Result<(), PublishFailure> {
     match publish_if_wanted(coordinator, job).await {
-        Err(PublishFailure::Over) => Ok(()),
+        Ok(()) | Err(PublishFailure::Over) => Ok(()),
         // The shards of a job that is over are deleted.
         Err(error) => match coordinator.ledger().job(job.id).await {
             Ok(Some(now)) if now.state.is_final() => Ok(()),
             _ => Err(error),
         },
-        Ok(()) => Ok(()),
     }
 }
 
