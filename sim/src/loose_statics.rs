@@ -469,6 +469,71 @@ impl Direction {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::equilibrium::{equilibrium, fixed_step_start};
+    use crate::testing::{closed_crane, linkage, random_state};
+    use hydroflex_openapi::machine::GravityMoment;
+
+    #[test]
+    fn the_tangent_is_the_derivative_of_the_residual_where_no_multiplier_pulls() {
+        let mut system = linkage();
+        system.conventions.gravity_moment = GravityMoment::Undeformed;
+        let settings = LooseStatics {
+            load_steps: 1,
+            relative_tolerance: 1e-6,
+            ground_body: None,
+        };
+        let locked = vec![1.0; system.cylinders.len()];
+        let mut newton = LooseNewton::new(&system, settings, &locked);
+        let mut ws = system.new_workspace();
+        let mut state = random_state(&system, 3);
+        newton.evaluate(0.7, &state, &mut ws);
+        newton.fill_jacobian(0.7, &state, &ws);
+        let (order, h) = (newton.residual.len(), 1e-6);
+        let scale = newton.jacobian.values.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
+        for column in 0..system.coordinate_count {
+            let mut at = |delta: f64| {
+                let before = state.q[column];
+                state.q[column] += delta;
+                newton.evaluate(0.7, &state, &mut ws);
+                state.q[column] = before;
+                newton.residual.clone()
+            };
+            let (above, below) = (at(h), at(-h));
+            // Rows of forces: also along θ itself, off the unit sphere.
+            for row in 0..system.coordinate_count {
+                let difference = (above[row] - below[row]) / (2.0 * h);
+                let tangent = newton.jacobian.values[row * order + column];
+                // Rounding of 1e-16/h and a third derivative times h².
+                assert!(
+                    (difference - tangent).abs() < 1e-8 * scale,
+                    "{row} {column}: {difference} {tangent}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_tight_tolerance_ends_at_the_equilibrium_and_a_loose_one_before() {
+        let (mut file, reduced) = closed_crane();
+        file.conventions.gravity_moment = GravityMoment::Undeformed;
+        let mut distance = |relative_tolerance: f64| {
+            file.conventions.statics = Some(LooseStatics {
+                load_steps: 2,
+                relative_tolerance,
+                ground_body: None,
+            });
+            let system = System::new(&file, &reduced, 50.0).unwrap();
+            let mut ws = system.new_workspace();
+            let exact = equilibrium(&system, &file, &[0.3, 0.1], &mut ws).unwrap();
+            let found = fixed_step_start(&system, &file, &[0.3, 0.1], &mut ws).unwrap();
+            let pairs = found.state.q.iter().zip(&exact.state.q);
+            pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        let (tight, loose) = (distance(1e-11), distance(1e-2));
+        // Metres, Euler parameters and modal coordinates.
+        assert!(tight < 1e-9, "{tight:e}");
+        assert!(loose > 10.0 * tight.max(1e-12), "{loose:e} {tight:e}");
+    }
 
     #[test]
     fn a_load_step_ends_at_the_first_residual_within_the_tolerance() {
