@@ -209,6 +209,20 @@ pub enum WindowError {
     Runs(#[from] RunsError),
 }
 
+impl WindowError {
+    /// No run of `runs` holds a window of `steps` samples.
+    pub(crate) fn longer_than(runs: &Runs, steps: usize) -> Self {
+        let lengths = runs.runs.iter().map(crate::runs::RunSamples::len);
+        let longest = lengths.max().unwrap_or(0);
+        Self::LongerThanRun {
+            steps,
+            window_s: steps as f64 * runs.sample_time_s,
+            longest,
+            longest_s: longest as f64 * runs.sample_time_s,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -267,17 +267,20 @@ struct Settling {
     windows: WindowCollector,
 }
 
+/// Threads that encode, at most: so many that reading and hashing, which one thread does, takes as long.
+const MOST_ENCODERS: usize = 8;
+
 const SETTLING_PATH: &str = "meta/settling.parquet";
 
 impl<S: Sink> Publisher<S> {
-    /// Starts a data set; `encoders` threads encode its samples beside the caller's, which encodes them itself
-    /// if there are none. The bytes are the same.
+    /// Starts a data set; `encoders` threads, 8 at most, encode its samples beside the caller's, which encodes them
+    /// itself if there are none. The bytes are the same.
     ///
     /// # Errors
     /// The sink reports one, or the threads cannot be started.
     pub fn with_encoders(spec: PublishSpec, sink: S, encoders: usize) -> Result<Self, PublishError> {
         let mut publisher = Self::new(spec, sink)?;
-        publisher.output.encoders = Encoders::new(encoders)?;
+        publisher.output.encoders = Encoders::new(encoders.min(MOST_ENCODERS))?;
         Ok(publisher)
     }
 

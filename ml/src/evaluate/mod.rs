@@ -143,19 +143,7 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         });
     }
     if evaluated.is_empty() {
-        let longest = inputs
-            .runs
-            .iter()
-            .map(crate::runs::RunSamples::len)
-            .max()
-            .unwrap_or(0);
-        return Err(WindowError::LongerThanRun {
-            steps: config.window_steps,
-            window_s: config.window_s,
-            longest,
-            longest_s: longest as f64 * runs.sample_time_s,
-        }
-        .into());
+        return Err(WindowError::longer_than(&inputs, config.window_steps).into());
     }
     let judge = |estimate: &[Vec<f64>]| -> Vec<TargetMetrics> {
         config

@@ -1,6 +1,6 @@
 //! Errors of many estimators side by side: one dot each on a logarithmic axis, one panel per case.
 
-use super::{BASELINE, ESTIMATE, GRID, INK, QUIET, REFERENCE, WIDTH, escape};
+use super::{BASELINE, ESTIMATE, GRID, QUIET, REFERENCE, WIDTH, escape, open_svg};
 use crate::evaluate::table::significant;
 use std::fmt::Write as _;
 
@@ -89,13 +89,7 @@ impl ErrorPicture {
         let count = rows().count() as f64;
         let height = TOP + self.panels.len() as f64 * PANEL_HEAD + count * ROW + BOTTOM;
         let bottom = height - BOTTOM + 6.0;
-        writeln!(
-            svg,
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" width=\"{WIDTH}\" height=\"{height}\" \
-             font-family=\"Inter, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif\" font-size=\"13\" fill=\"{INK}\">"
-        )?;
-        writeln!(svg, "<title>{}</title>", escape(&self.title))?;
-        writeln!(svg, "<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>")?;
+        open_svg(svg, height, &self.title)?;
         writeln!(
             svg,
             "<text x=\"24\" y=\"34\" font-size=\"20\" font-weight=\"600\">{}</text>\

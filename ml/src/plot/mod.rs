@@ -195,13 +195,7 @@ impl Picture {
 
     fn write_svg(&self, svg: &mut String) -> std::fmt::Result {
         let height = self.height();
-        writeln!(
-            svg,
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" width=\"{WIDTH}\" height=\"{height}\" \
-             font-family=\"Inter, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif\" font-size=\"13\" fill=\"{INK}\">"
-        )?;
-        writeln!(svg, "<title>{}</title>", escape(&self.title))?;
-        writeln!(svg, "<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>")?;
+        open_svg(svg, height, &self.title)?;
         self.header(svg)?;
         let time = Axis {
             min: self.time_s.first().copied().unwrap_or(0.0),
@@ -376,6 +370,17 @@ impl Picture {
         }
         writeln!(svg, "\"/>")
     }
+}
+
+/// Root element, title and white ground.
+fn open_svg(svg: &mut String, height: f64, title: &str) -> std::fmt::Result {
+    writeln!(
+        svg,
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" width=\"{WIDTH}\" height=\"{height}\" \
+         font-family=\"Inter, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif\" font-size=\"13\" fill=\"{INK}\">"
+    )?;
+    writeln!(svg, "<title>{}</title>", escape(title))?;
+    writeln!(svg, "<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>")
 }
 
 fn tick_step(ticks: &[f64]) -> f64 {

@@ -92,19 +92,7 @@ impl Comparison {
         let series = Series::new(&inputs, &self.problem.input_scaling);
         let windows = Windows::new(&series.run_rows, *steps, WindowCut::Overlapping);
         if windows.is_empty() {
-            let longest = inputs
-                .runs
-                .iter()
-                .map(crate::runs::RunSamples::len)
-                .max()
-                .unwrap_or(0);
-            return Err(WindowError::LongerThanRun {
-                steps: *steps,
-                window_s: *steps as f64 * runs.sample_time_s,
-                longest,
-                longest_s: longest as f64 * runs.sample_time_s,
-            }
-            .into());
+            return Err(WindowError::longer_than(&inputs, *steps).into());
         }
         let width = spec.targets.len();
         let part = Part {

@@ -431,18 +431,7 @@ fn check_lengths(runs: &Runs, steps: usize, windows: &Windows) -> Result<(), Tra
     if !windows.is_empty() {
         return Ok(());
     }
-    let longest = runs
-        .runs
-        .iter()
-        .map(crate::runs::RunSamples::len)
-        .max()
-        .unwrap_or(0);
-    Err(TrainError::Window(WindowError::LongerThanRun {
-        steps,
-        window_s: steps as f64 * runs.sample_time_s,
-        longest,
-        longest_s: longest as f64 * runs.sample_time_s,
-    }))
+    Err(TrainError::Window(WindowError::longer_than(runs, steps)))
 }
 
 fn target_rows(runs: &Runs, scaling: &Scaling) -> TargetRows {

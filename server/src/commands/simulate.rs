@@ -71,8 +71,6 @@ const DEFAULT_STEP_S: f64 = 0.005;
 /// Runs simulated between two visits to the writer, per thread; also bounded by their samples.
 const CHUNK_RUNS_PER_THREAD: usize = 16;
 const CHUNK_SAMPLES: usize = 200_000;
-/// Threads that encode, at most.
-const MOST_ENCODERS: usize = 8;
 
 /// Runs the command.
 ///
@@ -101,7 +99,7 @@ pub fn run(args: Args) -> anyhow::Result<()> {
     // One thread writes beside one that simulates; beside several it would be the slowest.
     let encoders = match pool.current_num_threads() {
         1 => 0,
-        threads => threads.min(MOST_ENCODERS),
+        threads => threads,
     };
     let mut publisher = Publisher::with_encoders(spec, sink, encoders)?;
     let (sender, receiver) = mpsc::sync_channel::<Vec<RunRecord>>(1);

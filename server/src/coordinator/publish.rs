@@ -37,9 +37,6 @@ const READ_AHEAD: usize = 1;
 /// How often the ledger is asked for the next shard while it is still simulated.
 const POLL: Duration = Duration::from_millis(20);
 
-/// Threads that encode, at most: so many that reading and hashing, which one thread does, takes as long.
-const MOST_ENCODERS: usize = 8;
-
 /// Why a data set was not published.
 #[derive(Debug, thiserror::Error)]
 pub enum PublishFailure {
@@ -214,8 +211,11 @@ async fn write(
             path: target.clone(),
             source,
         })?;
-        let publisher =
-            Publisher::with_encoders(machine.publish_spec(spec.clone(), &level), sink, encoders())?;
+        let publisher = Publisher::with_encoders(
+            machine.publish_spec(spec.clone(), &level),
+            sink,
+            crate::service::cores(),
+        )?;
         let (published, sink) = consume(receiver, publisher, &spec, &machine)?;
         sink.commit()
             .map_err(|source| PublishFailure::Scratch { path: target, source })?;
@@ -252,11 +252,6 @@ async fn write(
             "feeding ended without a reason".to_owned(),
         )),
     }
-}
-
-/// Threads that encode beside the one that reads.
-fn encoders() -> usize {
-    std::thread::available_parallelism().map_or(1, |cores| cores.get().min(MOST_ENCODERS))
 }
 
 /// Sends the shards of one kind in run order, as they are settled. False if the writer hung up.

@@ -639,7 +639,8 @@ mod tests {
     const VALUES: usize = STEPS * WIDTH;
     const TARGETS: usize = 2;
 
-    fn values(count: usize, seed: u32) -> Vec<f32> {
+    /// Numbers between -1 and 1.
+    pub(super) fn values(count: usize, seed: u32) -> Vec<f32> {
         let mut state = seed;
         (0..count)
             .map(|_| {
