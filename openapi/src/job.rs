@@ -285,6 +285,55 @@ pub enum RunStatus {
     Failed,
 }
 
+/// Which equations a run solved, and how. Chosen from the integrator asked for and what the machine is.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "kebab-case")]
+pub enum SolverPath {
+    /// `accurate`, minimal coordinates of one boom that moves in its plane; runs go side by side.
+    Planar,
+    /// `accurate`, free coordinates of a planar tree of bodies with closed loops.
+    Tree,
+    /// `accurate`, redundant coordinates with constraints: any machine.
+    #[default]
+    General,
+    /// The published scripts' scheme in redundant coordinates, fixed steps.
+    #[serde(rename = "trapezoidal-index-2")]
+    TrapezoidalIndex2,
+    /// Generalised-α in redundant coordinates, fixed steps.
+    GeneralizedAlpha,
+}
+
+impl SolverPath {
+    /// Every path.
+    pub const ALL: [Self; 5] = [
+        Self::Planar,
+        Self::Tree,
+        Self::General,
+        Self::TrapezoidalIndex2,
+        Self::GeneralizedAlpha,
+    ];
+
+    /// Name in JSON and in data sets.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Planar => "planar",
+            Self::Tree => "tree",
+            Self::General => "general",
+            Self::TrapezoidalIndex2 => "trapezoidal-index-2",
+            Self::GeneralizedAlpha => "generalized-alpha",
+        }
+    }
+
+    /// The path of that name.
+    #[must_use]
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|path| path.as_str() == name)
+    }
+}
+
 /// Type of samples in published files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]

@@ -2,8 +2,9 @@
 
 use crate::machines::ReadyMachine;
 use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
-use hydroflex_openapi::job::{JobSpec, RunFlag};
+use hydroflex_openapi::job::{JobSpec, RunFlag, SolverPath};
 use hydroflex_sim::scenario::{self, ScenarioError};
+use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
 
 /// The run as planned, with the record that it will get if it leaves no samples.
@@ -43,19 +44,26 @@ impl PlannedRun {
     /// goes through to whoever counts attempts.
     #[must_use]
     pub fn simulate(self, spec: &JobSpec, machine: &ReadyMachine) -> RunRecord {
-        let result = machine.simulator.run(&self.input, &settings(spec));
-        self.ended(result)
+        let settings = settings(spec);
+        let result = machine.simulator.run(&self.input, &settings);
+        self.ended(result, &machine.simulator, &settings)
     }
 
     /// The record of a simulated run.
-    fn ended(self, result: Result<Trajectory, RunFailure>) -> RunRecord {
-        self.record(result.into())
+    fn ended(
+        self,
+        result: Result<Trajectory, RunFailure>,
+        simulator: &Simulator,
+        settings: &RunSettings,
+    ) -> RunRecord {
+        let ended = Ended::of(result, &self.input, simulator, settings);
+        self.record(ended)
     }
 
     /// The record of a run without samples.
     #[must_use]
     pub fn failed(self, reason: String) -> RunRecord {
-        self.record(Ended::failed(reason))
+        self.record(Ended::failed(reason, None))
     }
 
     fn record(self, ended: Ended) -> RunRecord {
@@ -83,17 +91,25 @@ pub struct Ended {
 }
 
 impl Ended {
-    fn failed(reason: String) -> Self {
+    fn failed(reason: String, path: Option<SolverPath>) -> Self {
         Self {
             outcome: RunOutcome::Failed { reason },
             flags: Vec::new(),
-            statistics: RunStatistics::default(),
+            statistics: RunStatistics {
+                path,
+                ..RunStatistics::default()
+            },
         }
     }
-}
 
-impl From<Result<Trajectory, RunFailure>> for Ended {
-    fn from(result: Result<Trajectory, RunFailure>) -> Self {
+    /// What the simulator made of a run, or the path on which it failed.
+    #[must_use]
+    pub fn of(
+        result: Result<Trajectory, RunFailure>,
+        input: &RunInput,
+        simulator: &Simulator,
+        settings: &RunSettings,
+    ) -> Self {
         match result {
             Ok(trajectory) => Self {
                 statistics: RunStatistics {
@@ -101,6 +117,7 @@ impl From<Result<Trajectory, RunFailure>> for Ended {
                     rejected: trajectory.statistics.rejected,
                     iterations: trajectory.statistics.iterations,
                     factorisations: trajectory.statistics.factorisations,
+                    path: Some(trajectory.statistics.path),
                 },
                 outcome: RunOutcome::Ok(RunSamples {
                     sample_count: trajectory.sample_count,
@@ -108,7 +125,10 @@ impl From<Result<Trajectory, RunFailure>> for Ended {
                 }),
                 flags: trajectory.flags,
             },
-            Err(failure) => Self::failed(failure.to_string()),
+            Err(failure) => {
+                let path = simulator.solver_path(settings.integrator, input.payload_kg > 0.0);
+                Self::failed(failure.to_string(), path.ok())
+            }
         }
     }
 }
@@ -125,10 +145,11 @@ pub fn side_by_side(runs: &[PlannedRun], spec: &JobSpec, machine: &ReadyMachine)
 #[must_use]
 pub fn simulate_together(runs: Vec<PlannedRun>, spec: &JobSpec, machine: &ReadyMachine) -> Vec<RunRecord> {
     let inputs: Vec<RunInput> = runs.iter().map(|run| run.input.clone()).collect();
-    let results = machine.simulator.run_batch(&inputs, &settings(spec));
+    let settings = settings(spec);
+    let results = machine.simulator.run_batch(&inputs, &settings);
     runs.into_iter()
         .zip(results)
-        .map(|(run, result)| run.ended(result))
+        .map(|(run, result)| run.ended(result, &machine.simulator, &settings))
         .collect()
 }
 

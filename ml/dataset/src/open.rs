@@ -7,7 +7,7 @@ use arrow::datatypes::{Float32Type, Float64Type, UInt64Type};
 use arrow::error::ArrowError;
 use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::dataset::{DATASET_FORMAT, DatasetStatistics, Manifest, SplitName, WindowFacts};
-use hydroflex_openapi::job::{RunFlag, RunStatus};
+use hydroflex_openapi::job::{RunFlag, RunStatus, SolverPath};
 use parquet::arrow::ProjectionMask;
 use parquet::errors::ParquetError;
 use sha2::{Digest, Sha256};
@@ -43,6 +43,8 @@ pub struct RunRow {
     pub reason: Option<String>,
     /// What it met.
     pub flags: Vec<RunFlag>,
+    /// Which equations were solved; absent in data sets that do not say so.
+    pub solver_path: Option<SolverPath>,
     /// File with its samples, relative to the data set.
     pub file: Option<String>,
 }
@@ -577,6 +579,14 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         .flatten()
         .map(|name| RunFlag::from_name(name).ok_or_else(|| value_error("flags", name)))
         .collect::<Result<_, _>>()?;
+    // data sets made before it was recorded have no such column
+    let solver_path = match batch.column_by_name("solver_path") {
+        None => None,
+        Some(_) => text_at("solver_path")?,
+    };
+    let solver_path = solver_path
+        .map(|name| SolverPath::from_name(&name).ok_or_else(|| value_error("solver_path", &name)))
+        .transpose()?;
     Ok(RunRow {
         run_id: u64_at("run_id")?.unwrap_or_default(),
         split: SplitName::from_name(&split).ok_or_else(|| value_error("split", &split))?,
@@ -593,6 +603,7 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         },
         reason: text_at("reason")?,
         flags,
+        solver_path,
         file: text_at("file")?,
     })
 }

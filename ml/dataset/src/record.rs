@@ -1,6 +1,6 @@
 //! One run, between the simulator that made it and the files that keep it.
 
-use hydroflex_openapi::job::{RunFlag, RunStatus};
+use hydroflex_openapi::job::{RunFlag, RunStatus, SolverPath};
 
 /// One run: its parameters, how it ended, and its samples if it ended well.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,4 +93,6 @@ pub struct RunStatistics {
     pub iterations: u64,
     /// Jacobian evaluations with factorisation.
     pub factorisations: u64,
+    /// Which equations were solved, or would have been; absent if the run never came to the solver.
+    pub path: Option<SolverPath>,
 }

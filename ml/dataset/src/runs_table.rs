@@ -9,7 +9,7 @@ use arrow::array::{
 };
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
 use hydroflex_openapi::dataset::{ManifestFile, SplitName};
-use hydroflex_openapi::job::RunStatus;
+use hydroflex_openapi::job::{RunStatus, SolverPath};
 use parquet::arrow::ArrowWriter;
 use std::sync::Arc;
 
@@ -52,6 +52,7 @@ pub fn runs_schema(angles: &[String]) -> SchemaRef {
     for count in SOLVER_COLUMNS {
         fields.push(Field::new(count, DataType::UInt64, false));
     }
+    fields.push(Field::new("solver_path", DataType::Utf8, true));
     fields.push(Field::new("file", DataType::Utf8, true));
     fields.push(Field::new("row_group", DataType::UInt32, true));
     Arc::new(Schema::new(fields))
@@ -83,6 +84,7 @@ struct Columns {
     reason: StringBuilder,
     flags: ListBuilder<StringBuilder>,
     solver: [UInt64Builder; 4],
+    solver_path: StringBuilder,
     file: StringBuilder,
     row_group: UInt32Builder,
 }
@@ -144,6 +146,7 @@ impl Columns {
             reason: StringBuilder::new(),
             flags: ListBuilder::new(StringBuilder::new()).with_field(flag),
             solver: Default::default(),
+            solver_path: StringBuilder::new(),
             file: StringBuilder::new(),
             row_group: UInt32Builder::new(),
         }
@@ -171,6 +174,7 @@ impl Columns {
         for (column, count) in self.solver.iter_mut().zip(counts) {
             column.append_value(count);
         }
+        self.solver_path.append_option(s.path.map(SolverPath::as_str));
         self.row_group
             .append_option(place.as_ref().map(|place| place.row_group));
         self.file.append_option(place.map(|place| place.file));
@@ -192,6 +196,7 @@ impl Columns {
         for count in &mut self.solver {
             arrays.push(Arc::new(count.finish()));
         }
+        arrays.push(Arc::new(self.solver_path.finish()));
         arrays.push(Arc::new(self.file.finish()));
         arrays.push(Arc::new(self.row_group.finish()));
         arrays

@@ -152,6 +152,9 @@ fn as_json(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> serde_jso
         "flags": record.flags.iter().map(|flag| flag.as_str()).collect::<Vec<_>>(),
         "steps": record.statistics.steps,
         "rejected": record.statistics.rejected,
+        "iterations": record.statistics.iterations,
+        "factorisations": record.statistics.factorisations,
+        "solver_path": record.statistics.path,
         "wall_s": wall_s,
         "channels": channels,
     })
@@ -178,8 +181,14 @@ fn show(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> anyhow::Resu
     let statistics = &record.statistics;
     line(
         "steps",
-        format!("{}, {} rejected", statistics.steps, statistics.rejected),
+        format!(
+            "{}, {} rejected, {} factorisations",
+            statistics.steps, statistics.rejected, statistics.factorisations
+        ),
     )?;
+    if let Some(path) = statistics.path {
+        line("solver", path.as_str().to_owned())?;
+    }
     if let RunOutcome::Ok(samples) = &record.outcome {
         super::print_line(format_args!(
             "\n{:40} {:>14} {:>14} {:>14} {:>14}",

@@ -3,7 +3,7 @@
 use hydroflex_dataset::{PublishSpec, RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
-use hydroflex_openapi::job::{JobSpec, RunFlag};
+use hydroflex_openapi::job::{JobSpec, RunFlag, SolverPath};
 
 pub(crate) const STEPS: usize = 200;
 
@@ -127,6 +127,7 @@ pub(crate) fn record(kind: RunKind, run_id: u64, steps: usize) -> RunRecord {
             rejected: run_id % 3,
             iterations: 0,
             factorisations: 240,
+            path: Some(SolverPath::Planar),
         },
     }
 }
