@@ -1,5 +1,6 @@
 //! Machines at the front desk: refused before anything runs, with the field at fault.
 
+use super::notices;
 use hydroflex_dataset::PublishSpec;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::catalogue::MachineInfo;
@@ -7,6 +8,7 @@ use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
 use hydroflex_openapi::job::{JobSpec, MachineRef};
 use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
 use hydroflex_openapi::problem::FieldError;
+use hydroflex_openapi::status::JobNotice;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario;
 use hydroflex_worker::machines::{Machines, ReadyMachine, RefusedMachine};
@@ -48,6 +50,17 @@ impl MachineDesk {
                 Err(FieldError::new("/machine", "this machine cannot be checked"))
             }
         }
+    }
+
+    /// Remarks on a job of this machine.
+    pub async fn notices(&self, machine: Arc<CheckedMachine>, spec: &JobSpec) -> Vec<JobNotice> {
+        let spec = spec.clone();
+        let found = tokio::task::spawn_blocking(move || notices::of(machine.ready(), &spec)).await;
+        found.unwrap_or_else(|panic| {
+            // No job is refused because a remark on it fails.
+            tracing::error!(%panic, "a job made the look for remarks panic");
+            Vec::new()
+        })
     }
 }
 
