@@ -249,7 +249,7 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
     let tasks: Vec<_> = sockets
         .into_iter()
         .map(|mut socket| {
-            let request = request.clone();
+            let (request, address) = (request.clone(), address.clone());
             tokio::spawn(async move {
                 let mut seen = Seen::default();
                 let mut buffer = Vec::with_capacity(1 << 14);
@@ -263,6 +263,11 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
                     if status == 429 {
                         // A client that asks again at once is no client.
                         tokio::time::sleep(Duration::from_millis(20)).await;
+                    }
+                    // What the service refuses before it has read it ends the connection.
+                    if says_close(&buffer) {
+                        socket = TcpStream::connect(&address).await?;
+                        socket.set_nodelay(true)?;
                     }
                 }
             })
@@ -311,6 +316,14 @@ async fn exchange(socket: &mut TcpStream, request: &[u8], buffer: &mut Vec<u8>) 
             return Ok(status);
         }
     }
+}
+
+/// Whether the head of an answer says that the connection ends with it.
+fn says_close(answer: &[u8]) -> bool {
+    answer
+        .split(|byte| *byte == b'\n')
+        .take_while(|line| line.len() > 1)
+        .any(|line| line.eq_ignore_ascii_case(b"connection: close\r"))
 }
 
 /// The status of an answer that has come whole.
