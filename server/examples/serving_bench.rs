@@ -217,11 +217,14 @@ struct Seen {
     /// How late this program itself was, where it keeps to a schedule.
     late_us: Vec<f32>,
     statuses: HashMap<u16, u64>,
+    /// When the last answer came that was no refusal.
+    last: Option<Instant>,
 }
 
 impl Seen {
     fn add(&mut self, other: Self) {
         self.latencies_us.extend(other.latencies_us);
+        self.last = self.last.max(other.last);
         for (status, count) in other.statuses {
             *self.statuses.entry(status).or_default() += count;
         }
@@ -231,6 +234,7 @@ impl Seen {
         *self.statuses.entry(status).or_default() += 1;
         if status == 200 {
             self.latencies_us.push(begun.elapsed().as_secs_f32() * 1e6);
+            self.last = Some(Instant::now());
         }
     }
 }
@@ -277,7 +281,8 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
     for task in tasks {
         all.add(task.await??);
     }
-    let elapsed = begun.elapsed().as_secs_f64();
+    // Refused clients may hear it late, when nothing is answered any more.
+    let elapsed = all.last.map_or(seconds, |last| (last - begun).as_secs_f64());
     println!("{}", report(all, elapsed));
     Ok(())
 }
