@@ -218,11 +218,14 @@ struct Seen {
     /// How late this program itself was, where it keeps to a schedule.
     late_us: Vec<f32>,
     statuses: HashMap<u16, u64>,
+    /// When the last answer came that was no refusal.
+    last: Option<Instant>,
 }
 
 impl Seen {
     fn add(&mut self, other: Self) {
         self.latencies_us.extend(other.latencies_us);
+        self.last = self.last.max(other.last);
         for (status, count) in other.statuses {
             *self.statuses.entry(status).or_default() += count;
         }
@@ -232,6 +235,7 @@ impl Seen {
         *self.statuses.entry(status).or_default() += 1;
         if status == 200 {
             self.latencies_us.push(begun.elapsed().as_secs_f32() * 1e6);
+            self.last = Some(Instant::now());
         }
     }
 }
@@ -250,7 +254,7 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
     let tasks: Vec<_> = sockets
         .into_iter()
         .map(|mut socket| {
-            let request = request.clone();
+            let (request, address) = (request.clone(), address.clone());
             tokio::spawn(async move {
                 let mut seen = Seen::default();
                 let mut buffer = Vec::with_capacity(1 << 14);
@@ -265,6 +269,11 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
                         // A client that asks again at once is no client.
                         tokio::time::sleep(Duration::from_millis(20)).await;
                     }
+                    // What the service refuses before it has read it ends the connection.
+                    if says_close(&buffer) {
+                        socket = TcpStream::connect(&address).await?;
+                        socket.set_nodelay(true)?;
+                    }
                 }
             })
         })
@@ -273,7 +282,8 @@ async fn load(address: String, connections: u32, seconds: f64, request: Vec<u8>)
     for task in tasks {
         all.add(task.await??);
     }
-    let elapsed = begun.elapsed().as_secs_f64();
+    // Refused clients may hear it late, when nothing is answered any more.
+    let elapsed = all.last.map_or(seconds, |last| (last - begun).as_secs_f64());
     println!("{}", report(all, elapsed));
     Ok(())
 }
@@ -312,6 +322,14 @@ async fn exchange(socket: &mut TcpStream, request: &[u8], buffer: &mut Vec<u8>) 
             return Ok(status);
         }
     }
+}
+
+/// Whether the head of an answer says that the connection ends with it.
+fn says_close(answer: &[u8]) -> bool {
+    answer
+        .split(|byte| *byte == b'\n')
+        .take_while(|line| line.len() > 1)
+        .any(|line| line.eq_ignore_ascii_case(b"connection: close\r"))
 }
 
 /// The status of an answer that has come whole.

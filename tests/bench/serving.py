@@ -630,9 +630,10 @@ def report(results, arguments):
         lines += warned(half.values())
     if over := results.get("overload"):
         lines += ["", "## Overload (`--only overload`)", "",
-                  "The gate refuses what would wait more than 25 ms behind what was read before it. It cannot count what nobody has read yet: with many large "
-                  "bodies at once, receiving them is what takes long, also those that are refused then. Each connection asks again as soon as it is answered, 20 ms after a refusal. Latencies of what was answered, as the client sees them: "
-                  "with thousands of connections its own queue is in them.", "",
+                  "The gate refuses what would wait more than 25 ms behind what was read before it. Bodies above 256 KiB are asked about before they are received: "
+                  "two per core are received or computed at once, the others wait up to 25 ms for a place. The rest of a refused body is read away slowly, so that "
+                  "clients that read only after they have sent everything, as these do, see the 429; they then connect anew. Each connection asks again as soon as it "
+                  "is answered, 20 ms after a refusal. Latencies of what was answered, as the client sees them: with thousands of connections its own queue is in them.", "",
                   "| windows | body | connections | answers/s | answered | refused with 429 | p50 ms | p99 ms |", "|---|---|---|---|---|---|---|---|"]
         lines += [f"| {o['windows']} | {o['body']} | {o['connections']} | {o['per_second']:.0f} | {o['answered']:,} | {o['refused']:,} | "
                   f"{o['p50_us'] / 1e3:.1f} | {o['p99_us'] / 1e3:.1f} |" for o in over]
