@@ -41,6 +41,7 @@ fn main() -> anyhow::Result<()> {
         ["kernel"] => kernel(),
         ["series", folder, rows, calls] => series(Path::new(folder), rows.parse()?, calls.parse()?),
         ["serve", folder] => run(serve(PathBuf::from(folder))),
+        ["echo", request] => run(echo(std::fs::metadata(request)?.len().try_into()?)),
         ["register", folder, data] => run(register_into(PathBuf::from(folder), PathBuf::from(data))),
         ["open-loop", address, connections, seconds, rate, request] => {
             let request = std::fs::read(request).context("the request file")?;
@@ -65,7 +66,7 @@ fn main() -> anyhow::Result<()> {
             stream(address, model, sessions.parse()?, rate.parse()?, seconds.parse()?)
         }
         other => bail!(
-            "unknown arguments {other:?}: write, kernel, series, serve, register, load, open-loop or stream"
+            "unknown arguments {other:?}: write, kernel, series, serve, echo, register, load, open-loop or stream"
         ),
     }
 }
@@ -175,6 +176,30 @@ async fn register_into(folder: PathBuf, data: PathBuf) -> anyhow::Result<()> {
     let model = register::register_folder(&ledger, &blobs, &folder).await;
     println!("{}", json!({ "model": model }));
     Ok(())
+}
+
+/// Answers 200 to every `length` bytes without looking at them: what loopback, the scheduler and the
+/// machine take, of which no service is free.
+async fn echo(length: usize) -> anyhow::Result<()> {
+    let listener = TcpListener::bind("127.0.0.1:0").await?;
+    println!(
+        "{}",
+        json!({ "address": listener.local_addr()?, "model": "echo", "pid": std::process::id() })
+    );
+    std::io::stdout().flush()?;
+    loop {
+        let (mut socket, _) = listener.accept().await?;
+        socket.set_nodelay(true)?;
+        tokio::spawn(async move {
+            let mut request = vec![0; length];
+            while socket.read_exact(&mut request).await.is_ok()
+                && socket
+                    .write_all(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\nok")
+                    .await
+                    .is_ok()
+            {}
+        });
+    }
 }
 
 /// A service around one model, without workers, until standard input ends.
