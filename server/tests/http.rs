@@ -61,6 +61,30 @@ async fn a_job_of_runs_too_short_for_its_windows_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_job_varies_materials_and_is_refused_what_is_none() {
+    let desk = Desk::new().await;
+    let accepted = desk
+        .post("/v1/jobs", r#"{"runs": 8, "materials": ["steel", "aluminium"]}"#)
+        .await;
+    assert_eq!(
+        accepted.status,
+        202,
+        "{}",
+        String::from_utf8_lossy(&accepted.body)
+    );
+    let problem = desk
+        .post("/v1/jobs", r#"{"runs": 8, "materials": ["steel", "wood"]}"#)
+        .await
+        .problem(422);
+    let error = &problem.errors[0];
+    assert_eq!(
+        (error.pointer.as_str(), error.value.clone()),
+        ("/materials/1", Some("wood".into()))
+    );
+    assert!(error.allowed.as_ref().unwrap().contains("titanium"), "{error:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_mesh_is_uploaded_once_checked_and_named_by_a_job() {
     let desk = Desk::new().await;
     // The built-in mesh under a machine file that wants one given.

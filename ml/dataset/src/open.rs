@@ -35,6 +35,8 @@ pub struct RunRow {
     pub seed: Option<u64>,
     /// Payload.
     pub payload_kg: f64,
+    /// Material of the flexible bodies, where the job varied it.
+    pub material: Option<String>,
     /// Initial angles in the order of the machine file.
     pub angles_rad: Vec<f64>,
     /// How it ended.
@@ -579,12 +581,12 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         .flatten()
         .map(|name| RunFlag::from_name(name).ok_or_else(|| value_error("flags", name)))
         .collect::<Result<_, _>>()?;
-    // data sets made before it was recorded have no such column
-    let solver_path = match batch.column_by_name("solver_path") {
-        None => None,
-        Some(_) => text_at("solver_path")?,
+    // data sets made before these were recorded have no such columns
+    let later_text_at = |name: &str| match batch.column_by_name(name) {
+        None => Ok(None),
+        Some(_) => text_at(name),
     };
-    let solver_path = solver_path
+    let solver_path = later_text_at("solver_path")?
         .map(|name| SolverPath::from_name(&name).ok_or_else(|| value_error("solver_path", &name)))
         .transpose()?;
     Ok(RunRow {
@@ -592,6 +594,7 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         split: SplitName::from_name(&split).ok_or_else(|| value_error("split", &split))?,
         seed: u64_at("seed")?,
         payload_kg: f64_at("payload_kg")?,
+        material: later_text_at("material")?,
         angles_rad: angles
             .iter()
             .map(|angle| f64_at(&format!("angle_{angle}_rad")))

@@ -13,6 +13,8 @@ pub struct RunRecord {
     pub seed: Option<u64>,
     /// Payload.
     pub payload_kg: f64,
+    /// Material of the flexible bodies, where the job varies it.
+    pub material: Option<String>,
     /// Initial angles in the order of the machine file.
     pub angles_rad: Vec<f64>,
     /// How it ended.

@@ -28,7 +28,7 @@ pub struct RunPlace {
     pub row_group: u32,
 }
 
-/// Columns: `run_id, split, seed, payload_kg, angle_*_rad, status, reason, flags, solver_*, file,
+/// Columns: `run_id, split, seed, payload_kg, material, angle_*_rad, status, reason, flags, solver_*, file,
 /// row_group`.
 #[must_use]
 pub fn runs_schema(angles: &[String]) -> SchemaRef {
@@ -40,6 +40,7 @@ pub fn runs_schema(angles: &[String]) -> SchemaRef {
         Field::new("split", DataType::Utf8, false),
         Field::new("seed", DataType::UInt64, true),
         described("payload_kg", DataType::Float64, false, "kg", "mass"),
+        Field::new("material", DataType::Utf8, true),
     ];
     for angle in angles {
         let name = format!("angle_{angle}_rad");
@@ -79,6 +80,7 @@ struct Columns {
     split: StringBuilder,
     seed: UInt64Builder,
     payload_kg: Float64Builder,
+    material: StringBuilder,
     angles_rad: Vec<Float64Builder>,
     status: StringBuilder,
     reason: StringBuilder,
@@ -141,6 +143,7 @@ impl Columns {
             split: StringBuilder::new(),
             seed: UInt64Builder::new(),
             payload_kg: Float64Builder::new(),
+            material: StringBuilder::new(),
             angles_rad: (0..angles).map(|_| Float64Builder::new()).collect(),
             status: StringBuilder::new(),
             reason: StringBuilder::new(),
@@ -157,6 +160,7 @@ impl Columns {
         self.split.append_value(split.as_str());
         self.seed.append_option(record.seed);
         self.payload_kg.append_value(record.payload_kg);
+        self.material.append_option(record.material.as_deref());
         for (column, angle) in self.angles_rad.iter_mut().zip(&record.angles_rad) {
             column.append_value(*angle);
         }
@@ -186,6 +190,7 @@ impl Columns {
             Arc::new(self.split.finish()),
             Arc::new(self.seed.finish()),
             Arc::new(self.payload_kg.finish()),
+            Arc::new(self.material.finish()),
         ];
         for angle in &mut self.angles_rad {
             arrays.push(Arc::new(angle.finish()));

@@ -105,6 +105,7 @@ fn fixed_fields() -> Vec<Field> {
         Field::new("iterations", DataType::UInt64, false),
         Field::new("factorisations", DataType::UInt64, false),
         Field::new("path", DataType::Utf8, true),
+        Field::new("material", DataType::Utf8, true),
     ]
 }
 
@@ -224,6 +225,7 @@ struct Batch {
     flags: Vec<u32>,
     statistics: [Vec<u64>; 4],
     path: Vec<Option<&'static str>>,
+    material: Vec<Option<String>>,
     angles: Vec<Vec<f64>>,
     offsets: Vec<i32>,
     samples: SampleColumns,
@@ -247,6 +249,7 @@ impl Batch {
             flags: Vec::new(),
             statistics: Default::default(),
             path: Vec::new(),
+            material: Vec::new(),
             angles: vec![Vec::new(); schema.angles.len()],
             offsets: vec![0],
             samples: match schema.sample_type {
@@ -273,6 +276,7 @@ impl Batch {
             column.push(count);
         }
         self.path.push(s.path.map(SolverPath::as_str));
+        self.material.push(record.material.clone());
         for (column, angle) in self.angles.iter_mut().zip(&record.angles_rad) {
             column.push(*angle);
         }
@@ -308,6 +312,7 @@ impl Batch {
             columns.push(Arc::new(UInt64Array::from(counts)));
         }
         columns.push(Arc::new(StringArray::from(self.path)));
+        columns.push(Arc::new(StringArray::from(self.material)));
         for angle in self.angles {
             columns.push(Arc::new(Float64Array::from(angle)));
         }
@@ -464,6 +469,7 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
     let f64_at = |column: usize| batch.column(column).as_primitive::<Float64Type>().value(row);
     let seed = batch.column(2);
     let reason = batch.column(4);
+    let material = batch.column(11);
     let angles = fixed_fields().len();
     let outcome = if reason.is_valid(row) {
         RunOutcome::Failed {
@@ -492,6 +498,9 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
         run_id: u64_at(1),
         seed: seed.is_valid(row).then(|| u64_at(2)),
         payload_kg: f64_at(3),
+        material: material
+            .is_valid(row)
+            .then(|| material.as_string::<i32>().value(row).to_owned()),
         angles_rad: (angles..angles + schema.angles.len()).map(f64_at).collect(),
         outcome,
         flags: flags_of_bits(batch.column(5).as_primitive::<UInt32Type>().value(row))?,

@@ -146,6 +146,7 @@ fn as_json(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> serde_jso
         "run_id": record.run_id,
         "seed": record.seed,
         "payload_kg": record.payload_kg,
+        "material": record.material,
         "angles": angles,
         "status": record.status(),
         "reason": record.reason(),
@@ -167,6 +168,9 @@ fn show(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> anyhow::Resu
         line("seed", seed.to_string())?;
     }
     line("payload", format!("{} kg", record.payload_kg))?;
+    if let Some(material) = &record.material {
+        line("material", material.clone())?;
+    }
     for (angle, value) in machine.machine().file().angles.iter().zip(&record.angles_rad) {
         line(&angle.name, format!("{:.6} deg at the start", value.to_degrees()))?;
     }

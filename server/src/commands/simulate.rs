@@ -252,6 +252,7 @@ fn record(run: &RunInput, ended: Ended) -> RunRecord {
         run_id: run.run_id,
         seed: None,
         payload_kg: run.payload_kg,
+        material: None,
         angles_rad: run.angles_rad.clone(),
         outcome: ended.outcome,
         flags: ended.flags,

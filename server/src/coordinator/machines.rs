@@ -76,6 +76,7 @@ fn refusal(spec: &JobSpec, refused: &RefusedMachine) -> FieldError {
                 .value(sha256.as_str())
                 .allowed("the mesh_sha256 that POST /v1/meshes answered")
         }
+        (_, RefusedMachine::Material(error)) => error.clone(),
         (_, RefusedMachine::Store { body, .. }) => {
             FieldError::new(format!("/meshes/{body}"), refused.to_string())
         }
@@ -130,7 +131,9 @@ impl CheckedMachine {
         if !errors.is_empty() {
             return Err(errors);
         }
-        let part = scenario::reachable_part(spec, file, &self.0.simulator, REACH_DRAWS);
+        // Any material will do: lengths are those of the undeformed machine.
+        let simulator = self.0.simulator_of((!spec.materials.is_empty()).then_some(0));
+        let part = scenario::reachable_part(spec, file, simulator, REACH_DRAWS);
         if part < REACH_LEAST {
             return Err(vec![FieldError::new(
                 "/initial_angle_deg",

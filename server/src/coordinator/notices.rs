@@ -2,19 +2,20 @@
 //!
 //! A network that looks at windows longer than a third of a run sees few of them, and hardly any of a machine that has
 //! settled. Which window a job's networks will have is known before it runs: they take it from the job's settling runs, which are
-//! functions of the job. The first of them are simulated here, with the largest payload: all that count if runs go side by side (a few
+//! functions of the job. The first of them are simulated here, with the largest payload and the softest material: all that count if runs go side by side (a few
 //! milliseconds), two where each run takes a multiple of that. The bodies are reduced by then, as a job is not
 //! accepted before they are.
 
+use hydroflex_dataset::RunSamples;
 use hydroflex_dataset::window::WindowCollector;
-use hydroflex_dataset::{RunKind, RunOutcome};
 use hydroflex_openapi::dataset::WindowFacts;
-use hydroflex_openapi::job::{JobSpec, ValueOrRange, WindowRule};
+use hydroflex_openapi::job::{JobSpec, MaterialRef, ValueOrRange, WindowRule};
 use hydroflex_openapi::status::JobNotice;
+use hydroflex_sim::scenario::plan_settling_run;
+use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::summary::eigenvalue_window_s;
-use hydroflex_sim::trajectory::RunSettings;
+use hydroflex_sim::trajectory::{RunInput, RunSettings};
 use hydroflex_worker::machines::ReadyMachine;
-use hydroflex_worker::shard;
 
 /// Runs shorter than this many windows are remarked on.
 const WINDOWS_LEAST: f64 = 3.0;
@@ -38,13 +39,15 @@ fn window(machine: &ReadyMachine, spec: &JobSpec) -> Option<JobNotice> {
     if rules.is_empty() {
         rules.push(WindowRule::default());
     }
+    let softest = softest(spec);
+    let simulator = machine.simulator_of(softest);
     let simulated = rules
         .iter()
         .any(|rule| matches!(rule, WindowRule::Band | WindowRule::Paper))
-        .then(|| settling(machine, spec, payload_kg));
+        .then(|| settling(machine, spec, softest, payload_kg));
     let (window_s, how) = rules
         .iter()
-        .filter_map(|rule| length(*rule, machine, payload_kg, simulated.as_ref()))
+        .filter_map(|rule| length(*rule, simulator, payload_kg, simulated.as_ref()))
         .max_by(|a, b| a.0.total_cmp(&b.0))?;
     // Whole sample times: three windows of 0.1 s fit into 0.3 s.
     if WINDOWS_LEAST * window_s <= spec.duration_s * (1.0 + 1e-9) {
@@ -65,12 +68,12 @@ fn window(machine: &ReadyMachine, spec: &JobSpec) -> Option<JobNotice> {
 /// Length of the window by a rule, s, and where it is from.
 fn length(
     rule: WindowRule,
-    machine: &ReadyMachine,
+    simulator: &Simulator,
     payload_kg: f64,
     simulated: Option<&WindowFacts>,
 ) -> Option<(f64, &'static str)> {
     let by_eigenvalues = || {
-        let window_s = eigenvalue_window_s(&machine.simulator, payload_kg)?;
+        let window_s = eigenvalue_window_s(simulator, payload_kg)?;
         Some((window_s, "decay of the slowest motion to 1 %"))
     };
     match rule {
@@ -89,29 +92,39 @@ fn length(
     }
 }
 
-/// Windows of the job's first settling runs with this payload.
-fn settling(machine: &ReadyMachine, spec: &JobSpec, payload_kg: f64) -> WindowFacts {
+/// The job's softest material: the slowest, but for density.
+fn softest(spec: &JobSpec) -> Option<usize> {
+    let modulus = |material: &MaterialRef| material.material().map_or(f64::INFINITY, |m| m.youngs_modulus_pa);
+    let listed = spec.materials.iter().enumerate();
+    listed
+        .min_by(|(_, a), (_, b)| modulus(a).total_cmp(&modulus(b)))
+        .map(|(index, _)| index)
+}
+
+/// Windows of the job's first settling runs with this material and payload.
+fn settling(machine: &ReadyMachine, spec: &JobSpec, material: Option<usize>, payload_kg: f64) -> WindowFacts {
+    let simulator = machine.simulator_of(material);
     let settings = RunSettings {
         integrator: spec.integrator,
         sample_time_s: spec.sample_time_s,
     };
-    let together = machine.simulator.runs_side_by_side(&settings, payload_kg > 0.0);
+    let together = simulator.runs_side_by_side(&settings, payload_kg > 0.0);
     let runs = if together { RUNS_TOGETHER } else { RUNS_ALONE };
     let same = JobSpec {
         payload_kg: ValueOrRange::Value(payload_kg),
         settling_runs: runs,
-        // every column: the window is judged by deflections, kept or not
-        columns: Vec::new(),
         ..spec.clone()
     };
-    let mut windows = WindowCollector::new(machine.simulator.channels(), spec.sample_time_s);
-    let indices: Vec<u64> = (0..runs).collect();
-    // A run that panics or cannot be planned is the job's to report.
-    let records = shard::records(&same, machine, RunKind::Settling, &indices);
-    for record in records.unwrap_or_default() {
-        if let RunOutcome::Ok(samples) = &record.outcome {
-            windows.add(samples);
-        }
+    let mut windows = WindowCollector::new(simulator.channels(), spec.sample_time_s);
+    // A run that fails or cannot be planned is the job's to report.
+    let inputs: Vec<RunInput> = (0..runs)
+        .filter_map(|index| plan_settling_run(&same, simulator.machine().file(), simulator, index).ok())
+        .collect();
+    for trajectory in simulator.run_batch(&inputs, &settings).into_iter().flatten() {
+        windows.add(&RunSamples {
+            sample_count: trajectory.sample_count,
+            columns: trajectory.columns,
+        });
     }
     windows.finish()
 }
@@ -133,7 +146,6 @@ mod tests {
     use super::*;
     use hydroflex_openapi::job::MachineRef;
     use hydroflex_sim::machine::Machine;
-    use hydroflex_sim::simulator::Simulator;
 
     #[test]
     fn proposals_are_round_and_long_enough() {
@@ -146,10 +158,7 @@ mod tests {
     fn a_job_of_short_runs_is_told_which_would_do() {
         let machine = Machine::load("lift-boom", &[]).unwrap();
         let cache = std::env::temp_dir().join("hydroflex-test-cache");
-        let machine = ReadyMachine {
-            sha256: String::new(),
-            simulator: Simulator::with_cache(machine, Some(cache)),
-        };
+        let machine = ReadyMachine::new(machine, &[], &cache);
         let job = |text: &str| -> JobSpec { serde_json::from_str(text).unwrap() };
         let calm = job(r#"{"runs": 4, "payload_kg": 100}"#);
         assert_eq!(calm.machine, MachineRef::BuiltIn("lift-boom".to_owned()));
