@@ -35,6 +35,7 @@ pub(crate) async fn register_folder(ledger: &Ledger, blobs: &Blobs, path: &Path)
         machine_sha256: hash(b""),
         settling_shards: Vec::new(),
         run_shards: vec![1],
+        notices: Vec::new(),
     };
     let job = ledger.create_job(&new, None).await.unwrap().id();
     let worker = format!("worker.{job}");

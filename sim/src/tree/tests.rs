@@ -1,6 +1,6 @@
 //! The tree against the general path, the planar path and itself.
 
-use hydroflex_openapi::job::RunFlag;
+use hydroflex_openapi::job::{RunFlag, SolverPath};
 use hydroflex_openapi::machine::MachineFile;
 use nalgebra::Vector3;
 
@@ -227,7 +227,7 @@ fn a_closed_crane_moves_as_on_the_general_path() {
             ],
         };
         let (found, shares) = differences(&file, &reduced, &input, 100);
-        assert_eq!(found.statistics.path.name(), "planar_tree");
+        assert_eq!(found.statistics.path, SolverPath::Tree);
         for (name, share) in shares {
             let bound = if name.contains("acceleration") { 2e-2 } else { 5e-4 };
             assert!(share <= bound, "{name}, {payload_kg} kg: {share:e}");

@@ -115,6 +115,7 @@ fn new_job(run_shards: &[u64]) -> NewJob {
         machine_sha256: HASH.to_owned(),
         settling_shards: Vec::new(),
         run_shards: run_shards.to_vec(),
+        notices: Vec::new(),
     }
 }
 
