@@ -327,6 +327,7 @@ async fn publish(desk: &Desk) -> (DatasetInfo, Vec<Vec<u8>>) {
     desk.ledger.commit_shard(&claim, &result).await.unwrap();
     assert!(desk.ledger.begin_publishing(job).await.unwrap());
     let dataset = NewDataset {
+        round: 0,
         id: id.clone(),
         sha256,
         spec,

@@ -14,11 +14,15 @@ use common::Desk;
 use common::models::{register_folder, synthetic};
 use hydroflex_ml::predict::synthetic::signal;
 use hydroflex_openapi::catalogue::{AliasInfo, AliasList};
+use hydroflex_openapi::id::ModelId;
 use hydroflex_openapi::inference::{InferError, InferResponse, ModelMetadata, ServerMetadata};
 use hydroflex_openapi::prediction::PredictResponse;
 use hydroflex_server::prediction::gate::{Gate, Work};
 use serde_json::{Value, json};
+use std::sync::Arc;
 use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
 const INPUTS: [&str; 5] = [
     "valve_lift_ratio",
@@ -630,5 +634,181 @@ async fn requests_by_alias_never_fail_while_it_moves() {
     }
     for task in asking {
         assert!(!task.await.unwrap().is_empty());
+    }
+}
+
+/// What a connection says from now on: the head of an answer, and the answer with its body.
+async fn heard(socket: &mut TcpStream) -> String {
+    let mut answer = Vec::new();
+    loop {
+        let text = String::from_utf8_lossy(&answer).into_owned();
+        if let Some((head, body)) = text.split_once("\r\n\r\n") {
+            let length = head.lines().find_map(|line| {
+                let (name, value) = line.split_once(": ")?;
+                name.eq_ignore_ascii_case("content-length")
+                    .then(|| value.parse::<usize>().unwrap())
+            });
+            if body.len() >= length.unwrap_or(0) {
+                return text;
+            }
+        }
+        assert!(
+            socket.read_buf(&mut answer).await.unwrap() > 0,
+            "closed after {text:?}"
+        );
+    }
+}
+
+/// A request of 1,000 windows in bytes, 480 kB: its head with more lines, and its body.
+fn large(id: &ModelId, more: &str) -> (String, Vec<u8>) {
+    let samples: Vec<u8> = signal(0, 12_000)
+        .iter()
+        .flat_map(|value| value.to_le_bytes())
+        .collect();
+    let request = json!({
+        "inputs": [{"name": "window", "datatype": "FP64", "shape": [1000, 12, 5],
+            "parameters": {"binary_data_size": samples.len()}}],
+        "outputs": [{"name": "estimates", "parameters": {"binary_data": false}}],
+    });
+    let (body, length) = binary(&request, &samples);
+    let head = format!(
+        "POST /v2/models/{id}/infer HTTP/1.1\r\nhost: x\r\ninference-header-content-length: {length}\r\n{more}\r\n"
+    );
+    (head, body)
+}
+
+fn is_refusal(answer: &str) -> bool {
+    let head = answer.to_ascii_lowercase();
+    head.starts_with("http/1.1 429")
+        && head.contains("retry-after: 1\r\n")
+        && head.contains("connection: close\r\n")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_large_body_is_refused_before_it_is_received_and_every_client_sees_it() {
+    let desk = Desk::changed(1000, |state| state.behind_gate(Gate::new(1, Duration::ZERO))).await;
+    let id = desk.register(&synthetic("RLR", 1)).await;
+    let address = desk.listen().await;
+    let connect = async || TcpStream::connect(address).await.unwrap();
+    let places = (
+        desk.state.gate().large().await.unwrap(),
+        desk.state.gate().large().await.unwrap(),
+    );
+
+    // Nothing of the body is sent, asked about or not.
+    let length = format!("content-length: {}\r\n", large(&id, "").1.len());
+    let asking = format!("{length}expect: 100-continue\r\n");
+    for more in [&length, &asking] {
+        let mut socket = connect().await;
+        let (head, _) = large(&id, more);
+        socket.write_all(head.as_bytes()).await.unwrap();
+        let answer = heard(&mut socket).await;
+        assert!(is_refusal(&answer), "{answer}");
+        assert!(answer.contains("as much as this machine can do"), "{answer}");
+    }
+    // As Python's http.client: nothing is read before everything is sent, here 32 MB.
+    let mut socket = connect().await;
+    let (head, _) = large(&id, "content-length: 33554432\r\n");
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket.write_all(&vec![0; 33_554_432]).await.unwrap();
+    let answer = heard(&mut socket).await;
+    assert!(is_refusal(&answer), "{answer}");
+    // A length that nobody has told: refused as soon as the body is large.
+    let mut socket = connect().await;
+    let (head, body) = large(&id, "transfer-encoding: chunked\r\n");
+    socket.write_all(head.as_bytes()).await.unwrap();
+    for chunk in body.chunks(10_000) {
+        let chunk = [format!("{:x}\r\n", chunk.len()).as_bytes(), chunk, b"\r\n"].concat();
+        socket.write_all(&chunk).await.unwrap();
+    }
+    let answer = heard(&mut socket).await;
+    assert!(is_refusal(&answer), "{answer}");
+    // Engineering units the same way; small requests are answered meanwhile.
+    let path = format!("/v1/models/{id}/predict");
+    let long = columns(20_000).to_string();
+    let told = long.len().to_string();
+    let json = [("content-type", "application/json"), ("content-length", &told)];
+    let refused = desk.send("POST", &path, &json, long.clone()).await;
+    refused.problem(429);
+    assert_eq!(refused.header("connection"), "close");
+    assert_eq!(desk.post(&path, &columns(20).to_string()).await.status, 200);
+
+    drop(places);
+    assert_eq!(desk.send("POST", &path, &json, long).await.status, 200);
+    let mut socket = connect().await;
+    let (head, body) = large(&id, &asking);
+    socket.write_all(head.as_bytes()).await.unwrap();
+    assert_eq!(heard(&mut socket).await, "HTTP/1.1 100 Continue\r\n\r\n");
+    socket.write_all(&body).await.unwrap();
+    let answer = heard(&mut socket).await;
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer:.300}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_large_bodies_at_once_are_answered_or_refused_and_small_ones_answered() {
+    let desk = Desk::changed(1000, |state| {
+        state.behind_gate(Gate::new(1, Duration::from_millis(25)))
+    })
+    .await;
+    let id = desk.register(&synthetic("best", 1)).await;
+    let address = desk.listen().await;
+    let (head, body) = large(&id, &format!("content-length: {}\r\n", large(&id, "").1.len()));
+    let request = Arc::new([head.as_bytes(), &body].concat());
+    let clients: Vec<_> = (0..32)
+        .map(|_| {
+            let request = request.clone();
+            tokio::spawn(async move {
+                let mut answered = 0;
+                for _ in 0..4 {
+                    let mut socket = TcpStream::connect(address).await.unwrap();
+                    socket.write_all(&request).await.unwrap();
+                    let answer = heard(&mut socket).await;
+                    let is_answer = answer.starts_with("HTTP/1.1 200");
+                    assert!(is_answer || is_refusal(&answer), "{answer:.300}");
+                    answered += u32::from(is_answer);
+                }
+                answered
+            })
+        })
+        .collect();
+    let path = format!("/v1/models/{id}/predict");
+    for _ in 0..50 {
+        assert_eq!(desk.post(&path, &columns(20).to_string()).await.status, 200);
+    }
+    let mut answered = 0;
+    for client in clients {
+        answered += client.await.unwrap();
+    }
+    assert!(answered > 0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_sender_that_falls_silent_does_not_keep_its_place() {
+    let desk = Desk::changed(1000, |state| state.behind_gate(Gate::new(1, Duration::ZERO))).await;
+    let id = desk.register(&synthetic("RLR", 1)).await;
+    let address = desk.listen().await;
+    let (head, body) = large(&id, &format!("content-length: {}\r\n", large(&id, "").1.len()));
+    let mut silent = Vec::new();
+    for _ in 0..2 {
+        let mut socket = TcpStream::connect(address).await.unwrap();
+        socket.write_all(head.as_bytes()).await.unwrap();
+        socket.write_all(&body[..1000]).await.unwrap();
+        silent.push(socket);
+    }
+    loop {
+        let mut socket = TcpStream::connect(address).await.unwrap();
+        socket.write_all(head.as_bytes()).await.unwrap();
+        socket.write_all(&body).await.unwrap();
+        let answer = heard(&mut socket).await;
+        if answer.starts_with("HTTP/1.1 200") {
+            break;
+        }
+        assert!(is_refusal(&answer), "{answer}");
+    }
+    // The silent ones are answered when they go on.
+    for mut socket in silent {
+        socket.write_all(&body[1000..]).await.unwrap();
+        let answer = heard(&mut socket).await;
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer:.300}");
     }
 }

@@ -413,7 +413,7 @@ impl Ledger {
             .await?;
             tx.execute(
                 "UPDATE jobs SET runs_done = runs_done - $2, runs_failed = runs_failed - $2, \
-                 settling_done = settling_done - $3, finished_ms = NULL WHERE id = $1",
+                 settling_done = settling_done - $3, finished_ms = NULL, round = round + 1 WHERE id = $1",
                 values![id.as_str(), runs, settling],
             )
             .await?;

@@ -4,13 +4,13 @@
 //! that it has pointed at, counted from 1; a bare name takes the tag as its version (`boom`, `stable`).
 
 use super::AppState;
+use super::body::{self, CLOSING, NotReceived, Received};
 use crate::prediction::LoadedModel;
 use crate::prediction::gate::{Busy, Work};
 use crate::prediction::infer::{self, HEADER_LENGTH, Output, WINDOW};
 use crate::prediction::registry::ModelUnusable;
 use axum::Json;
-use axum::body::Bytes;
-use axum::extract::rejection::BytesRejection;
+use axum::body::Body;
 use axum::extract::{FromRequestParts, Path, State};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -332,7 +332,7 @@ pub async fn infer(
     State(state): State<AppState>,
     named: Named,
     headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
+    body: Body,
 ) -> Result<Response, InferenceError> {
     estimate(&state, named, &headers, body).await
 }
@@ -355,7 +355,7 @@ pub async fn infer_version(
     State(state): State<AppState>,
     named: Named,
     headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
+    body: Body,
 ) -> Result<Response, InferenceError> {
     estimate(&state, named, &headers, body).await
 }
@@ -364,15 +364,24 @@ async fn estimate(
     state: &AppState,
     named: Named,
     headers: &HeaderMap,
-    body: Result<Bytes, BytesRejection>,
+    body: Body,
 ) -> Result<Response, InferenceError> {
-    let body = body.map_err(|rejection| {
-        let detail = match rejection.status() {
-            StatusCode::PAYLOAD_TOO_LARGE => format!("at most {BODY_LIMIT_BYTES} bytes are read here"),
-            _ => rejection.body_text(),
-        };
-        InferenceError::new(rejection.status(), detail)
-    })?;
+    let received = body::receive(state.gate(), headers, body, BODY_LIMIT_BYTES).await;
+    let Received { bytes: body, place } = match received {
+        Ok(received) => received,
+        Err(NotReceived::Broken(detail)) => {
+            return Err(InferenceError::new(
+                StatusCode::BAD_REQUEST,
+                format!("the body broke off: {detail}"),
+            ));
+        }
+        Err(NotReceived::Busy) => return Ok((CLOSING, InferenceError::from(Busy)).into_response()),
+        Err(NotReceived::TooLarge { limit_bytes }) => {
+            let detail = format!("at most {limit_bytes} bytes are read here");
+            let error = InferenceError::new(StatusCode::PAYLOAD_TOO_LARGE, detail);
+            return Ok((CLOSING, error).into_response());
+        }
+    };
     let json_length = match headers.get(HEADER_LENGTH) {
         None => None,
         Some(value) => Some(
@@ -402,7 +411,8 @@ async fn estimate(
         let permit = state.gate().thread().await?;
         tokio::task::spawn_blocking(move || {
             let answer = compute(&named, &body, json_length);
-            drop(permit);
+            // Held to the end of the work, even if the caller has gone.
+            drop((permit, place));
             answer
         })
         .await

@@ -10,6 +10,7 @@
 pub mod error;
 pub mod auth;
 pub mod extract;
+pub mod body;
 pub mod jobs;
 pub mod events;
 pub mod datasets;
@@ -190,8 +191,7 @@ fn prediction_routes() -> OpenApiRouter<AppState> {
         .routes(routes!(inference::model_ready))
         .routes(routes!(inference::model_version_ready))
         .routes(routes!(inference::infer))
-        .routes(routes!(inference::infer_version))
-        .layer(DefaultBodyLimit::max(inference::BODY_LIMIT_BYTES));
+        .routes(routes!(inference::infer_version));
     OpenApiRouter::new()
         .routes(routes!(predict::predict))
         .merge(inference)

@@ -1,6 +1,7 @@
 //! `/v1/models/{model}/predict` and `/v1/models/{model}/stream`: estimates in engineering units.
 
 use super::AppState;
+use super::body::{self, CLOSING, NotReceived, Received};
 use super::error::ApiError;
 use super::extract::{BODY_LIMIT_BYTES, Id, parse_json};
 use crate::prediction::LoadedModel;
@@ -15,8 +16,8 @@ use axum::extract::rejection::QueryRejection;
 use axum::extract::ws::{
     CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code, rejection::WebSocketUpgradeRejection,
 };
-use axum::extract::{FromRequest, Query, Request, State};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::extract::{Query, Request, State};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use hydroflex_openapi::id::ModelRef;
 use hydroflex_openapi::prediction::{PredictRequest, PredictResponse, Signal};
@@ -191,15 +192,19 @@ async fn predict_json(
     request: Request,
     answer_form: Form,
 ) -> Result<Response, ApiError> {
-    let bytes = Bytes::from_request(request, state).await.map_err(|rejection| {
-        if rejection.status() == StatusCode::PAYLOAD_TOO_LARGE {
-            ApiError::TooLarge {
-                limit_bytes: BODY_LIMIT_BYTES as u64,
-            }
-        } else {
-            ApiError::Malformed(rejection.body_text())
+    let (head, body) = request.into_parts();
+    let received = body::receive(state.gate(), &head.headers, body, BODY_LIMIT_BYTES).await;
+    let Received { bytes, place } = match received {
+        Ok(received) => received,
+        Err(NotReceived::Broken(detail)) => {
+            return Err(ApiError::Malformed(format!("the body broke off: {detail}")));
         }
-    })?;
+        Err(NotReceived::Busy) => return Ok((CLOSING, ApiError::from(Busy)).into_response()),
+        Err(NotReceived::TooLarge { limit_bytes }) => {
+            let limit_bytes = limit_bytes as u64;
+            return Ok((CLOSING, ApiError::TooLarge { limit_bytes }).into_response());
+        }
+    };
     if bytes.len() <= INLINE_BODY_BYTES && answer_form == Form::Json {
         let _ticket = state.gate().inline(Work::Text, bytes.len()).await?;
         let request: PredictRequest = parse_json(&bytes)?;
@@ -209,6 +214,7 @@ async fn predict_json(
     on_a_thread(state, move || {
         let request: PredictRequest = parse_json(&bytes)?;
         let answer = model.predict(&request).map_err(ApiError::Invalid)?;
+        drop(place);
         match answer_form {
             Form::Json => Ok(Json(answer).into_response()),
             Form::Table(form) => {
@@ -227,9 +233,13 @@ async fn predict_table(
     form: TableForm,
     answer_form: Form,
 ) -> Result<Response, ApiError> {
-    let upload = state.gate().upload()?;
+    let (head, body) = request.into_parts();
+    let stream = body.into_data_stream();
+    let Ok(upload) = state.gate().upload() else {
+        body::read_away(state.gate(), &head.headers, stream);
+        return Ok((CLOSING, ApiError::from(Busy)).into_response());
+    };
     let scratch = state.prediction_scratch();
-    let stream = request.into_body().into_data_stream();
     let table = Spool::receive(stream, &scratch, TABLE_LIMIT_BYTES)
         .await
         .map_err(|error| match error {

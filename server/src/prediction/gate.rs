@@ -4,7 +4,9 @@
 //! Small requests are answered on the threads that read them. Each first joins the end of the queue
 //! (see [`Gate::inline`]), so that everything that has arrived is known before anything is computed, and
 //! is refused when what stands before it would take longer than [`WAIT`]: the bytes that wait times
-//! what a byte took lately. Long ones wait for a thread of their own.
+//! what a byte took lately. Long ones wait for a thread of their own. Large bodies (see
+//! [`crate::http::body`]) are asked about before they are received, since nobody can count what nobody has
+//! read yet: a few at once have a [place](Gate::large), the others wait no longer than small requests may.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -26,6 +28,10 @@ const BELIEVED_PS: [u64; 2] = [50, 100_000];
 const WAITING_PER_CORE: usize = 4;
 /// Recordings that are received at once.
 const UPLOADS: usize = 64;
+/// Large bodies that are received or computed at once, per core: one while another is computed.
+const LARGE_PER_CORE: usize = 2;
+/// Refused bodies whose rest is read away at once.
+const LEFTOVERS: usize = 16;
 /// Streaming sessions at once.
 const SESSIONS: usize = 10_000;
 
@@ -53,6 +59,9 @@ pub struct Gate {
     waiting: AtomicUsize,
     waiting_limit: usize,
     uploads: Arc<Semaphore>,
+    wait: Duration,
+    large: Arc<Semaphore>,
+    leftovers: Arc<Semaphore>,
     sessions: Arc<Semaphore>,
 }
 
@@ -105,6 +114,9 @@ impl Gate {
             waiting: AtomicUsize::new(0),
             waiting_limit: WAITING_PER_CORE * cores,
             uploads: Arc::new(Semaphore::new(UPLOADS)),
+            wait,
+            large: Arc::new(Semaphore::new(LARGE_PER_CORE * cores)),
+            leftovers: Arc::new(Semaphore::new(LEFTOVERS)),
             sessions: Arc::new(Semaphore::new(SESSIONS)),
         }
     }
@@ -169,6 +181,27 @@ impl Gate {
         self.threads.clone().acquire_owned().await.map_err(|_| Busy)
     }
 
+    /// Admits a large body to be received and computed.
+    ///
+    /// # Errors
+    /// If there is no place for it within the time that a request may wait.
+    pub async fn large(&self) -> Result<OwnedSemaphorePermit, Busy> {
+        let large = self.large.clone();
+        if let Ok(place) = large.clone().try_acquire_owned() {
+            return Ok(place);
+        }
+        match tokio::time::timeout(self.wait, large.acquire_owned()).await {
+            Ok(Ok(place)) => Ok(place),
+            // The semaphore is never closed.
+            Ok(Err(_)) | Err(_) => Err(Busy),
+        }
+    }
+
+    /// Turns of those whose rest is read away.
+    pub(crate) fn leftovers(&self) -> Arc<Semaphore> {
+        self.leftovers.clone()
+    }
+
     /// Admits a recording to be received.
     ///
     /// # Errors
@@ -230,6 +263,16 @@ mod tests {
             known(Work::Bytes) <= 500 + BELIEVED_PS[1] / MEMORY,
             "too short to tell"
         );
+    }
+
+    #[tokio::test]
+    async fn large_bodies_have_a_few_places() {
+        let gate = Gate::new(1, Duration::ZERO);
+        let first = gate.large().await.unwrap();
+        let _second = gate.large().await.unwrap();
+        assert_eq!(gate.large().await.map(drop), Err(Busy));
+        drop(first);
+        assert!(gate.large().await.is_ok());
     }
 
     #[tokio::test]

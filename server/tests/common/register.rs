@@ -52,6 +52,7 @@ pub(crate) async fn register_folder(ledger: &Ledger, blobs: &Blobs, path: &Path)
     assert!(ledger.begin_publishing(job).await.unwrap());
     let dataset_sha256 = hash(job.to_string().as_bytes());
     let dataset = NewDataset {
+        round: 0,
         id: DatasetId::of_sha256(&dataset_sha256).unwrap(),
         sha256: dataset_sha256,
         spec,

@@ -206,7 +206,11 @@ fn differences(
 
 fn signal(k: u32, phase: f64) -> f64 {
     let x = f64::from(k);
-    if k % 23 < 6 { -0.8 } else { (0.7 * x + phase).sin() }
+    if k % 23 < 6 {
+        -0.8
+    } else {
+        libm::sin(0.7 * x + phase)
+    }
 }
 
 #[test]

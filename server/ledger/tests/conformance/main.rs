@@ -136,6 +136,7 @@ fn result(object: &str) -> ShardResult {
 
 fn new_dataset() -> NewDataset {
     NewDataset {
+        round: 0,
         id: DatasetId::of_sha256(HASH).unwrap(),
         sha256: HASH.to_owned(),
         spec: spec(4, 0),
