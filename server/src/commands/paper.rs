@@ -23,6 +23,7 @@ use hydroflex_openapi::job::{
     Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowCut, WindowRule,
 };
 use hydroflex_openapi::model::{EvaluationReport, FaultRate};
+use hydroflex_openapi::sweep;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
@@ -172,15 +173,19 @@ pub enum SensorSet {
 }
 
 impl SensorSet {
+    fn set(self) -> sweep::SensorSet {
+        match self {
+            Self::All => sweep::SensorSet::All,
+            Self::Usp => sweep::SensorSet::Usp,
+            Self::Usdp2 => sweep::SensorSet::Usdp2,
+            Self::Usd => sweep::SensorSet::Usd,
+            Self::Us => sweep::SensorSet::Us,
+        }
+    }
+
     /// How the paper writes it.
     fn label(self) -> &'static str {
-        match self {
-            Self::All => "U s ds p1 p2",
-            Self::Usp => "U s p1 p2",
-            Self::Usdp2 => "U s ds p2",
-            Self::Usd => "U s ds",
-            Self::Us => "U s",
-        }
+        self.set().label()
     }
 
     fn name(self) -> &'static str {
@@ -195,36 +200,13 @@ impl SensorSet {
 
     /// Channels of a data set that belong to it.
     fn channels(self, dataset: &Dataset) -> Vec<String> {
-        let wanted: &[fn(&str) -> bool] = match self {
-            Self::All => &[is_valve, is_length, is_velocity, is_pressure],
-            Self::Usp => &[is_valve, is_length, is_pressure],
-            Self::Usdp2 => &[is_valve, is_length, is_velocity, is_rod_pressure],
-            Self::Usd => &[is_valve, is_length, is_velocity],
-            Self::Us => &[is_valve, is_length],
-        };
         dataset
             .channels()
             .iter()
             .map(|channel| channel.name.clone())
-            .filter(|name| wanted.iter().any(|is| is(name)))
+            .filter(|name| self.set().has(name))
             .collect()
     }
-}
-
-fn is_valve(name: &str) -> bool {
-    name.starts_with("valve_")
-}
-fn is_length(name: &str) -> bool {
-    name.starts_with("length_")
-}
-fn is_velocity(name: &str) -> bool {
-    name.starts_with("velocity_")
-}
-fn is_pressure(name: &str) -> bool {
-    name.starts_with("pressure_")
-}
-fn is_rod_pressure(name: &str) -> bool {
-    is_pressure(name) && name.ends_with("_rod_pa")
 }
 
 /// One trained network and what it is worth on one payload.
