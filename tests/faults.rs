@@ -7,10 +7,12 @@
 
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::status::{JobState, JobStatus};
+use hydroflex_openapi::sweep::{SweepState, SweepStatus};
 use hydroflex_tests::{Pilot, ServiceUnderTest, Start, servers, signal};
 use nix::sys::signal::Signal;
 use std::path::Path;
 use std::sync::OnceLock;
+use std::time::{Duration, Instant};
 
 /// A job whose runs take a few milliseconds each: the stories are about the service.
 fn job(runs: u64) -> serde_json::Value {
@@ -415,6 +417,94 @@ fn job_with_training() -> serde_json::Value {
         "windows": "overlapping",
     }]);
     job
+}
+
+/// A sweep as it is.
+fn sweep(service: &ServiceUnderTest, path: &str) -> SweepStatus {
+    serde_json::from_slice(&service.get(path).unwrap()).unwrap()
+}
+
+/// Waits until a sweep is as wanted.
+fn wait_for_sweep(
+    service: &ServiceUnderTest,
+    path: &str,
+    wanted: impl Fn(&SweepStatus) -> bool,
+) -> SweepStatus {
+    let start = Instant::now();
+    loop {
+        let status = sweep(service, path);
+        if wanted(&status) {
+            return status;
+        }
+        assert!(
+            start.elapsed() < Duration::from_mins(4),
+            "{status:?}\n{}",
+            service.log()
+        );
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn a_sweep_killed_in_the_middle_ends_with_the_table_of_an_undisturbed_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut start = workers(1);
+    start.environment.push(("HYDROFLEX_TRAINERS", "2".to_owned()));
+    let service = ServiceUnderTest::start(folder.path(), &start).unwrap();
+    let id = service.submit(&job(RUNS)).unwrap().job_id.to_string();
+    let dataset = service.wait_for(&id, finished).unwrap().dataset_id.unwrap();
+    let request = serde_json::json!({
+        "dataset_id": dataset,
+        "structures": ["L", "RLR"],
+        "sensors": ["all", "us"],
+        "seeds": [0, 1],
+        "spec": {
+            "window": { "rule": "given", "window_s": 0.1 },
+            "targets": ["deflection_tip_y_m"],
+            "epochs": 60,
+        },
+    });
+    let submit = |service: &ServiceUnderTest| {
+        let status = service.post_json("/v1/sweeps", &request).unwrap();
+        format!("/v1/sweeps/{}", status["sweep_id"].as_str().unwrap())
+    };
+    let table = |service: &ServiceUnderTest, path: &str| {
+        String::from_utf8(service.get(&format!("{path}/table.csv")).unwrap()).unwrap()
+    };
+    let path = submit(&service);
+    let status = wait_for_sweep(&service, &path, |s| s.state.is_final());
+    assert_eq!(
+        status.state,
+        SweepState::Succeeded,
+        "{status:?}\n{}",
+        service.log()
+    );
+    assert_eq!((status.progress.total, status.progress.succeeded), (8, 8));
+    let undisturbed = table(&service, &path);
+    assert_eq!(undisturbed.lines().count(), 9, "{undisturbed}");
+    assert!(undisturbed.contains("least_squares_mae"), "{undisturbed}");
+
+    let path = submit(&service);
+    let begun = |s: &SweepStatus| s.progress.succeeded >= 2 && s.progress.running > 0;
+    let status = wait_for_sweep(&service, &path, |s| begun(s) || s.state.is_final());
+    assert!(!status.state.is_final(), "{status:?}");
+    // A trainer dies, and then everything.
+    signal(service.wait_for_children("train", 2).unwrap()[0], Signal::SIGKILL).unwrap();
+    let status = wait_for_sweep(&service, &path, |s| s.progress.succeeded >= 4);
+    assert!(!status.state.is_final(), "{status:?}");
+    service.kill().unwrap();
+    let service = ServiceUnderTest::start(folder.path(), &start).unwrap();
+    let status = wait_for_sweep(&service, &path, |s| s.state.is_final());
+    assert_eq!(
+        status.state,
+        SweepState::Succeeded,
+        "{status:?}\n{}",
+        service.log()
+    );
+    assert_eq!(table(&service, &path), undisturbed);
+    let svg = service.get(&format!("{path}/plot.svg")).unwrap();
+    assert!(String::from_utf8(svg).unwrap().matches("<circle").count() >= 8);
+    service.terminate().unwrap();
 }
 
 #[test]

@@ -12,8 +12,26 @@ pub struct Structure {
     pub linear_skip: bool,
     /// How its layers are put together.
     pub form: Form,
-    /// Widths of the hidden layers and what follows each of them.
-    hidden: Vec<(usize, Vec<Activation>)>,
+    hidden: Vec<Hidden>,
+}
+
+/// A hidden layer and what follows it.
+#[derive(Debug, Clone, PartialEq)]
+struct Hidden {
+    width: usize,
+    activations: Vec<Activation>,
+    /// Whether some of its values are left out at random, in training only.
+    dropout: bool,
+}
+
+impl Hidden {
+    fn new(width: usize, activations: Vec<Activation>) -> Self {
+        Self {
+            width,
+            activations,
+            dropout: false,
+        }
+    }
 }
 
 /// How layers are put together.
@@ -52,7 +70,7 @@ pub enum StructureError {
     /// Unknown letter.
     #[error(
         "structure {name:?}: letter {letter:?} is unknown; give \"best\", or letters of L (linear), T (tanh), \
-         S (sigmoid), R (ReLU), E (ELU) such as L, TLT, TLTLT, TLSLT, TLSLTLSLT, ELE, RLR"
+         S (sigmoid), R (ReLU), E (ELU), D (dropout) such as L, TLT, TLTLT, TLSLT, TLSLTLSLT, ELE, RLR, RDLR"
     )]
     UnknownLetter {
         /// Structure.
@@ -66,6 +84,14 @@ pub enum StructureError {
          exported nor served; give \"best\", or letters such as RLR"
     )]
     Comparison {
+        /// Structure.
+        name: String,
+    },
+    /// Dropout in a place where it says nothing.
+    #[error(
+        "structure {name:?}: D (dropout) comes last before an L or the end, and once, as in RDLR or TLTD"
+    )]
+    MisplacedDropout {
         /// Structure.
         name: String,
     },
@@ -103,7 +129,7 @@ impl Structure {
             let widest = width.unwrap_or(BEST_WIDTHS[0]);
             let hidden = BEST_WIDTHS
                 .iter()
-                .map(|&w| ((w * widest).div_ceil(BEST_WIDTHS[0]), vec![Activation::Silu]))
+                .map(|&w| Hidden::new((w * widest).div_ceil(BEST_WIDTHS[0]), vec![Activation::Silu]))
                 .collect();
             return Ok(Self {
                 name: name.to_owned(),
@@ -113,11 +139,22 @@ impl Structure {
             });
         }
         let width = width.unwrap_or(window_steps);
-        let mut hidden: Vec<(usize, Vec<Activation>)> = vec![(width, Vec::new())];
+        let mut hidden = vec![Hidden::new(width, Vec::new())];
         for letter in name.chars() {
+            if letter != 'L' && hidden.last().is_some_and(|layer| layer.dropout) {
+                return Err(StructureError::MisplacedDropout {
+                    name: name.to_owned(),
+                });
+            }
             let activation = match letter {
                 'L' => {
-                    hidden.push((width, Vec::new()));
+                    hidden.push(Hidden::new(width, Vec::new()));
+                    continue;
+                }
+                'D' => {
+                    if let Some(layer) = hidden.last_mut() {
+                        layer.dropout = true;
+                    }
                     continue;
                 }
                 'T' => Activation::Tanh,
@@ -131,8 +168,8 @@ impl Structure {
                     });
                 }
             };
-            if let Some((_, activations)) = hidden.last_mut() {
-                activations.push(activation);
+            if let Some(layer) = hidden.last_mut() {
+                layer.activations.push(activation);
             }
         }
         Ok(Self {
@@ -167,13 +204,13 @@ impl Structure {
             name: name.to_owned(),
             linear_skip: false,
             form,
-            hidden: vec![(width.unwrap_or(COMPARISON_WIDTH), Vec::new())],
+            hidden: vec![Hidden::new(width.unwrap_or(COMPARISON_WIDTH), Vec::new())],
         })
     }
 
     /// The linear maps of a network for comparison, for `inputs` window values.
     fn comparison_layers(&self, inputs: usize, targets: usize) -> Vec<DenseLayer> {
-        let width = self.hidden[0].0;
+        let width = self.hidden[0].width;
         let shapes = match self.form {
             Form::Dense => return Vec::new(),
             Form::Rnn { steps } => [(inputs / steps, width), (width, width), (width, targets)],
@@ -199,7 +236,13 @@ impl Structure {
             .collect()
     }
 
-    /// Layers for a number of window values and targets. Names count linear maps and activations
+    /// Whether values of each hidden layer are left out at random in training.
+    #[must_use]
+    pub fn dropouts(&self) -> Vec<bool> {
+        self.hidden.iter().map(|layer| layer.dropout).collect()
+    }
+
+    /// Layers for a number of window values and outputs. Names count linear maps, activations and dropout
     /// alike, as in a PyTorch `Sequential`.
     #[must_use]
     pub fn layers(&self, inputs: usize, targets: usize) -> Vec<DenseLayer> {
@@ -209,15 +252,15 @@ impl Structure {
         let mut layers = Vec::with_capacity(self.hidden.len() + 1);
         let mut position = 0;
         let mut width = inputs;
-        for (outputs, activations) in &self.hidden {
+        for hidden in &self.hidden {
             layers.push(DenseLayer {
                 name: format!("net.{position}"),
                 inputs: width,
-                outputs: *outputs,
-                activations: activations.clone(),
+                outputs: hidden.width,
+                activations: hidden.activations.clone(),
             });
-            position += 1 + activations.len();
-            width = *outputs;
+            position += 1 + hidden.activations.len() + usize::from(hidden.dropout);
+            width = hidden.width;
         }
         layers.push(DenseLayer {
             name: format!("net.{position}"),
@@ -262,6 +305,20 @@ mod tests {
         let layers = Structure::parse("RLR", 60, None).unwrap().layers(300, 1);
         let names: Vec<&str> = layers.iter().map(|l| l.name.as_str()).collect();
         assert_eq!(names, ["net.0", "net.2", "net.4"]);
+    }
+
+    #[test]
+    fn dropout_is_no_layer_and_counts_in_names() {
+        let structure = Structure::parse("RDLR", 60, None).unwrap();
+        assert_eq!(structure.dropouts(), [true, false]);
+        let layers = structure.layers(300, 1);
+        let names: Vec<&str> = layers.iter().map(|l| l.name.as_str()).collect();
+        assert_eq!(names, ["net.0", "net.3", "net.5"]);
+        assert_eq!(shapes("RDLR"), shapes("RLR"));
+        for name in ["DRL", "RDDL", "RDTL"] {
+            let error = Structure::parse(name, 60, None).unwrap_err();
+            assert!(matches!(error, StructureError::MisplacedDropout { .. }), "{name}");
+        }
     }
 
     #[test]

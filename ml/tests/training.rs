@@ -437,3 +437,122 @@ fn a_changed_file_is_not_loaded() {
     let error = Model::load(&folder.0.join("model")).unwrap_err();
     assert!(error.to_string().contains("SHA256SUMS"), "{error}");
 }
+
+#[test]
+fn a_network_of_several_steps_estimates_the_end_of_its_window() {
+    let folder = Folder::new("several");
+    let spec = TrainingSpec {
+        output_steps: Some(10),
+        width: None,
+        width_windows: Some(2),
+        ..spec("TLT", 60)
+    };
+    train(
+        &data(),
+        &spec,
+        &mut go_on,
+        &folder.0.join("c"),
+        &folder.0.join("m"),
+    )
+    .unwrap();
+    let model = Model::load(&folder.0.join("m")).unwrap();
+    let config = model.config();
+    // Every estimated sample has the window of 20 steps before it.
+    assert_eq!((config.window_steps, config.output_steps), (30, 10));
+    let outputs: Vec<usize> = config.layers.iter().map(|layer| layer.outputs).collect();
+    assert_eq!(outputs, [40, 40, 10]);
+    let unseen = oscillators(4, 200);
+    let report = evaluate::evaluate(&model, &unseen, "").unwrap().report;
+    assert!(report.targets[0].r2 > 0.9, "{:?}", report.targets[0]);
+    let names: Vec<&str> = report.baselines.iter().map(|b| b.name.as_str()).collect();
+    assert_eq!(names, ["least_squares", "quasi_static", "persistence"]);
+
+    let predictor = model.predictor();
+    let mut workspace = predictor.workspace();
+    let run = &unseen.runs[0];
+    let window: Vec<f64> = (40..70)
+        .flat_map(|row| [run.columns[0][row], run.columns[1][row]])
+        .collect();
+    let all = predictor.predict_all_steps(&window, &mut workspace);
+    let mut last = [0.0];
+    predictor.predict_window(&window, &mut last, &mut workspace);
+    assert_eq!(all.len(), predictor.output_steps());
+    assert!((all[9] - last[0]).abs() < 1e-9, "{} {}", all[9], last[0]);
+    let worst = (60..70)
+        .zip(&all)
+        .map(|(row, estimate)| (run.columns[2][row] - estimate).abs())
+        .fold(0.0, f64::max);
+    assert!(worst < 0.3e-3, "{worst}");
+
+    for (structure, steps) in [("best", 10), ("TLT", 0)] {
+        let wrong = TrainingSpec {
+            structure: structure.to_owned(),
+            output_steps: Some(steps),
+            ..spec.clone()
+        };
+        let refused = train(
+            &data(),
+            &wrong,
+            &mut go_on,
+            &folder.0.join("c"),
+            &folder.0.join("n"),
+        );
+        assert!(
+            matches!(
+                refused,
+                Err(TrainError::SingleStep { .. } | TrainError::NotPositive { .. })
+            ),
+            "{refused:?}"
+        );
+    }
+}
+
+#[test]
+fn dropout_is_for_training_alone() {
+    let folder = Folder::new("dropout");
+    let spec = spec("TDLT", 40);
+    let files = |name: &str, spec: &TrainingSpec| {
+        train(
+            &data(),
+            spec,
+            &mut go_on,
+            &folder.0.join("c"),
+            &folder.0.join(name),
+        )
+        .unwrap();
+        folder.files(name)
+    };
+    let dropped = files("a", &spec);
+    assert_eq!(dropped, files("b", &spec), "the same seed gives the same bytes");
+    let stronger = TrainingSpec {
+        dropout: Some(0.4),
+        ..spec.clone()
+    };
+    assert_ne!(
+        dropped["model.safetensors"],
+        files("d", &stronger)["model.safetensors"]
+    );
+    // The golden predictions were checked: twice the same estimate, whatever was left out in training.
+    let model = Model::load(&folder.0.join("a")).unwrap();
+    let names: Vec<&str> = model.config().layers.iter().map(|l| l.name.as_str()).collect();
+    assert_eq!(names, ["net.0", "net.3", "net.5"]);
+    let report = evaluate::evaluate(&model, &oscillators(4, 200), "")
+        .unwrap()
+        .report;
+    assert!(report.targets[0].r2 > 0.8, "{:?}", report.targets[0]);
+    let without = TrainingSpec {
+        structure: "TLT".to_owned(),
+        ..stronger
+    };
+    let refused = train(
+        &data(),
+        &without,
+        &mut go_on,
+        &folder.0.join("c"),
+        &folder.0.join("n"),
+    );
+    assert!(
+        matches!(refused, Err(TrainError::NoDropout { .. })),
+        "{refused:?}"
+    );
+}

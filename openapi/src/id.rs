@@ -1,4 +1,4 @@
-//! Identifiers. Jobs, trainings and shards are things that happen: a time-ordered UUID. Data sets and
+//! Identifiers. Jobs, trainings, sweeps and shards are things that happen: a time-ordered UUID. Data sets and
 //! models are things that are: the first half of a SHA-256 over their content.
 
 use serde::{Deserialize, Serialize};
@@ -59,6 +59,7 @@ macro_rules! event_id {
 
 event_id!(JobId, "A job.");
 event_id!(TrainingId, "A training.");
+event_id!(SweepId, "A sweep: many trainings on one data set.");
 event_id!(ShardId, "A shard of a job: what one worker holds at a time.");
 
 macro_rules! content_id {

@@ -405,7 +405,7 @@ pub enum WindowRule {
 #[serde(deny_unknown_fields)]
 pub struct TrainingSpec {
     /// `best` (our default: least squares on the window plus a network for the rest), or the
-    /// paper's letters: `L`, `RLR`, `TLTLT`, `TLSLTLSLT`, `ELE`, …
+    /// paper's letters: `L`, `RLR`, `TLTLT`, `TLSLTLSLT`, `ELE`, …, `RDLR` (with dropout)
     #[serde(default = "default_structure")]
     pub structure: String,
     /// Channels in; default: valve, length, velocity and both pressures of every cylinder.
@@ -417,9 +417,23 @@ pub struct TrainingSpec {
     /// Length of the window.
     #[serde(default)]
     pub window: WindowRule,
+    /// Samples that the network estimates at once, the last ones of its window, which is longer by as many: 10, 15 and 30
+    /// in the paper. Absent: the last one. Estimates of a recording or a signal are those of the last sample.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub output_steps: Option<usize>,
     /// Width of the hidden layers; default: the number of window steps.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub width: Option<usize>,
+    /// The width as a multiple of the number of window steps: 2 or 3 in the paper's supplement.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub width_windows: Option<usize>,
+    /// Part of a layer's values that dropout (letter D) leaves out in training; default: 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dropout: Option<f64>,
+    /// Inputs that the coefficients of our network's linear map follow, by their values at the end of the window; default:
+    /// the lengths of the cylinders, else the angles.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub follow: Vec<String>,
     /// Seed of initial weights and batches.
     #[serde(default)]
     pub seed: u64,
@@ -474,7 +488,11 @@ impl Default for TrainingSpec {
             inputs: Vec::new(),
             targets: Vec::new(),
             window: WindowRule::default(),
+            output_steps: None,
             width: None,
+            width_windows: None,
+            dropout: None,
+            follow: Vec::new(),
             seed: 0,
             epochs: None,
             time_limit_s: None,

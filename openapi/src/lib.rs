@@ -19,6 +19,7 @@ pub mod job;
 pub mod dataset;
 pub mod id;
 pub mod status;
+pub mod sweep;
 pub mod event;
 pub mod catalogue;
 pub mod prediction;

@@ -29,6 +29,10 @@ pub struct ModelConfig {
     pub inputs: Vec<ScaledChannel>,
     /// Channels out.
     pub targets: Vec<ScaledChannel>,
+    /// Samples that the network estimates at once, the last ones of the window: it gives `output_steps` rows of the
+    /// targets, oldest first. Estimates are the last row.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub output_steps: usize,
     /// Whether a linear map of the window (`skip.*`) is added to the network's output.
     pub linear_skip: bool,
     /// Slow signals that the coefficients of the linear map follow; absent when they are constant.
@@ -57,6 +61,15 @@ pub struct ModelConfig {
     pub envelope: Option<Envelope>,
     /// Windows with their estimates, checked whenever the model is loaded.
     pub golden: Vec<GoldenPrediction>,
+}
+
+fn one() -> usize {
+    1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]
+fn is_one(steps: &usize) -> bool {
+    *steps == 1
 }
 
 /// A channel with the affine map into the network's numbers: `scaled = (value − offset) / scale`.
@@ -354,7 +367,8 @@ pub struct EvaluationReport {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct BaselineMetrics {
     /// `least_squares`: linear map of the same window, fitted on the model's training runs;
-    /// `quasi_static`: linear map of the window's last row.
+    /// `quasi_static`: linear map of the window's last row;
+    /// `persistence`: the true value where the window begins, as if the structure had been measured until then.
     pub name: String,
     /// One per target.
     pub targets: Vec<TargetMetrics>,

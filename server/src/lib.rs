@@ -9,6 +9,7 @@
 )]
 
 pub mod calibration;
+pub mod sweeps;
 pub mod http;
 pub mod coordinator;
 pub mod prediction;

@@ -32,6 +32,9 @@ enum Command {
     /// Submit and follow jobs of a running service
     #[command(subcommand)]
     Job(commands::job::Command),
+    /// Train many networks on one data set, and compare them
+    #[command(subcommand)]
+    Sweep(commands::sweep::Command),
     /// Replay one run of a job and show it
     Rerun(commands::rerun::Args),
     /// Make a data set again from its manifest, and compare the hashes
@@ -64,6 +67,7 @@ fn main() -> std::process::ExitCode {
         Command::Simulate(args) => commands::simulate::run(args),
         Command::Machine(command) => commands::machine::run(command),
         Command::Job(command) => commands::job::run(command),
+        Command::Sweep(command) => commands::sweep::run(command),
         Command::Rerun(args) => commands::rerun::run(args),
         Command::Reproduce(args) => commands::reproduce::run(args),
         Command::Dataset(command) => commands::dataset::run(command),

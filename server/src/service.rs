@@ -38,6 +38,8 @@ pub struct ServiceConfig {
     pub cache: Option<PathBuf>,
     /// Local worker processes.
     pub workers: usize,
+    /// Local trainer processes: trainings that go on at once. They share the cores.
+    pub trainers: usize,
     /// The hydroflex binary, from which local processes are started.
     pub executable: PathBuf,
     /// File for what local processes say; standard error if absent.
@@ -64,6 +66,7 @@ impl ServiceConfig {
             store: None,
             cache: None,
             workers: cores(),
+            trainers: 1,
             executable: std::env::current_exe().context("cannot find the hydroflex binary")?,
             worker_log: None,
             lease: Duration::from_secs(10),
@@ -139,7 +142,8 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
         store,
         cache,
         workers: config.workers,
-        trainer_threads: cores(),
+        trainers: config.trainers,
+        trainer_threads: (cores() / config.trainers.max(1)).max(1),
         log: config.worker_log,
         longest_stop: 2 * config.lease,
         limits: config.limits,

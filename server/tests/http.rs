@@ -488,3 +488,92 @@ async fn machines_health_metrics_and_the_browsable_page_answer() {
     let document: serde_json::Value = desk.get("/openapi.json").await.json();
     assert!(document["paths"]["/v1/jobs"].is_object());
 }
+
+/// What is refused about a sweep on this data set, with the pointers that must be named.
+async fn refused(desk: &Desk, dataset: &str, body: serde_json::Value, pointers: &[&str]) {
+    let mut body = body;
+    body["dataset_id"] = dataset.into();
+    let problem = desk.post("/v1/sweeps", &body.to_string()).await.problem(422);
+    let found: Vec<&str> = problem.errors.iter().map(|e| e.pointer.as_str()).collect();
+    assert_eq!(found, pointers, "{body}");
+    for error in &problem.errors {
+        assert!(error.allowed.is_some() && error.value.is_some(), "{error:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_sweep_is_accepted_shown_and_cancelled_and_a_bad_one_refused_by_name() {
+    use hydroflex_openapi::sweep::{SweepPage, SweepState, SweepStatus, SweepTable};
+    let desk = Desk::new().await;
+    let (dataset, _) = publish(&desk).await;
+    let id = dataset.dataset_id.as_str();
+    let window = serde_json::json!({ "rule": "given", "window_s": 0.1 });
+    let body = serde_json::json!({ "dataset_id": id, "grid": "published", "spec": { "window": window } });
+    let accepted = desk.post("/v1/sweeps", &body.to_string()).await;
+    assert_eq!(
+        accepted.status,
+        202,
+        "{}",
+        String::from_utf8_lossy(&accepted.body)
+    );
+    let status: SweepStatus = accepted.json();
+    assert_eq!((status.progress.total, status.progress.open), (125, 125));
+    assert_eq!(status.state, SweepState::Running);
+    let place = accepted.header("location").to_owned();
+    let table: SweepTable = desk.get(&format!("{place}/table")).await.json();
+    assert_eq!(table.rows.len(), 125);
+    let cell = |index: usize| {
+        let row = &table.rows[index];
+        (row.structure.as_str(), row.sensors.as_str(), row.seed)
+    };
+    assert_eq!(cell(0), ("L", "U s ds p1 p2", 0));
+    assert_eq!(cell(6), ("L", "U s p1 p2", 1));
+    assert_eq!(cell(124), ("RLR", "U s", 4));
+    let csv = desk.get(&format!("{place}/table.csv")).await;
+    assert!(csv.header("content-type").starts_with("text/csv"));
+    let text = String::from_utf8(csv.body).unwrap();
+    let columns: Vec<usize> = text.lines().map(|line| line.split(',').count()).collect();
+    assert_eq!((columns.len(), columns.iter().max()), (126, columns.iter().min()));
+    assert_eq!(desk.get(&format!("{place}/table.md")).await.status, 200);
+    let svg = desk.get(&format!("{place}/plot.svg")).await;
+    assert_eq!(svg.header("content-type"), "image/svg+xml");
+    let cancelled: SweepStatus = desk.post(&format!("{place}/cancel"), "").await.json();
+    assert_eq!(cancelled.state, SweepState::Cancelled);
+    let listed: SweepPage = desk.get("/v1/sweeps").await.json();
+    assert_eq!(listed.sweeps, [cancelled]);
+    assert_eq!(desk.post(&format!("{place}/retry"), "").await.status, 200);
+
+    let json = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+    let spec = r#""spec": { "window": { "rule": "given", "window_s": 0.1 } }"#;
+    for (body, pointers) in [
+        (format!(r#"{{ "structures": [], {spec} }}"#), &["/structures"][..]),
+        (
+            format!(r#"{{ "structures": ["RLR", "RQR"], {spec} }}"#),
+            &["/structures/1"],
+        ),
+        (
+            format!(r#"{{ "structures": ["L", "L"], {spec} }}"#),
+            &["/structures/1"],
+        ),
+        (
+            format!(r#"{{ "sensors": ["us", ["length_lift_m", "nothing"]], {spec} }}"#),
+            &["/sensors/1/1"],
+        ),
+        (format!(r#"{{ "sensors": [[]], {spec} }}"#), &["/sensors/0"]),
+        (
+            r#"{ "windows": [{ "rule": "given", "window_s": 99.0 }] }"#.to_owned(),
+            &["/windows/0/window_s"],
+        ),
+        (
+            r#"{ "spec": { "structure": "RQR", "window": { "rule": "given", "window_s": 0.1 } } }"#
+                .to_owned(),
+            &["/spec/structure"],
+        ),
+    ] {
+        refused(&desk, id, json(&body), pointers).await;
+    }
+    let seeds: Vec<u64> = (0..1025).collect();
+    let many = serde_json::json!({ "seeds": seeds, "spec": { "window": window } });
+    refused(&desk, id, many, &[""]).await;
+    refused(&desk, &"0".repeat(32), serde_json::json!({}), &["/dataset_id"]).await;
+}

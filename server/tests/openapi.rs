@@ -13,6 +13,7 @@ use hydroflex_openapi::job::JobSpec;
 use hydroflex_openapi::prediction::{PredictRequest, PredictResponse};
 use hydroflex_openapi::problem::Problem;
 use hydroflex_openapi::status::{JobStatus, TrainingRequest};
+use hydroflex_openapi::sweep::SweepRequest;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
@@ -107,13 +108,14 @@ fn examples_are_what_the_types_say() {
     round_trip::<JobSpec>("job-request-full.json");
     round_trip::<JobStatus>("job-status.json");
     round_trip::<TrainingRequest>("training-request.json");
+    round_trip::<SweepRequest>("sweep-request.json");
     round_trip::<PredictRequest>("predict-request.json");
     round_trip::<PredictResponse>("predict-response.json");
     round_trip::<Problem>("problem.json");
     round_trip::<JobEvent>("event.json");
     assert_eq!(
         std::fs::read_dir(contract().join("examples")).unwrap().count(),
-        8,
+        9,
         "an example is not tested"
     );
 }

@@ -21,8 +21,9 @@ def main():
         try:
             test_triton.JOB["train"] = [
                 {"structure": structure, "epochs": 3, "window": {"rule": "given", "window_s": 0.1}}
-                for structure in ("best", "TLSLTLSLT")
+                for structure in ("best", "TLSLTLSLT", "TDLT")
             ]
+            test_triton.JOB["train"][2]["output_steps"] = 10
             test_triton.trained_model(service)
             for model in service.ask("/v1/models")["models"]:
                 check(service, model["model_id"])
@@ -45,6 +46,11 @@ def check(service, model):
     scale = numpy.array([channel["scale"] for channel in config["targets"]])
     spread = numpy.array([channel["scale"] for channel in config["inputs"]])
     limited = 0
+    if config.get("output_steps", 1) > 1:
+        # Every estimated sample, the last of which is the estimate.
+        all_steps, last = session.run(["all_steps", "estimates"], {"window": known})
+        assert all_steps.shape == (len(known), config["output_steps"], len(config["targets"]))
+        assert (numpy.abs(all_steps[:, -1] - last) / scale).max() < NEAR
     for windows, tolerance in [
         (known, NEAR),
         (known + 0.01 * spread * rng.standard_normal(known.shape), NEAR),

@@ -4,6 +4,7 @@ pub mod metrics;
 pub mod intervals;
 pub mod table;
 pub mod faults;
+pub mod profile;
 
 use crate::model::Model;
 use crate::model::weights::LinearWeights;
@@ -131,6 +132,8 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
             all.estimate[t].extend_from_slice(&series.columns[t]);
             all.least_squares[t].extend_from_slice(&least_squares[t]);
             all.quasi_static[t].extend_from_slice(&quasi_static[t]);
+            // The reference where the window begins.
+            all.persistence[t].extend_from_slice(&target.columns[t][..reference[t].len()]);
         }
         evaluated.push(RunEvaluation {
             run_id: input.run_id,
@@ -182,6 +185,10 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
             BaselineMetrics {
                 name: "quasi_static".to_owned(),
                 targets: judge(&all.quasi_static),
+            },
+            BaselineMetrics {
+                name: "persistence".to_owned(),
+                targets: judge(&all.persistence),
             },
         ],
         inside_envelope: predictor.has_envelope().then(|| inside as f64 / windows as f64),
@@ -261,6 +268,7 @@ struct Columns {
     estimate: Vec<Vec<f64>>,
     least_squares: Vec<Vec<f64>>,
     quasi_static: Vec<Vec<f64>>,
+    persistence: Vec<Vec<f64>>,
 }
 
 impl Columns {
@@ -271,6 +279,7 @@ impl Columns {
             estimate: empty(),
             least_squares: empty(),
             quasi_static: empty(),
+            persistence: empty(),
         }
     }
 }

@@ -90,7 +90,9 @@ fn title(target: &TargetMetrics) -> String {
     format!("{name} [{unit}]")
 }
 
-fn baseline_name(name: &str) -> &str {
+/// A baseline for people.
+#[must_use]
+pub fn baseline_name(name: &str) -> &str {
     match name {
         "least_squares" => "least squares",
         "quasi_static" => "quasi-static",

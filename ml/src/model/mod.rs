@@ -238,8 +238,18 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
         }
         width = layer.outputs;
     }
-    if !config.layers.is_empty() && width != config.targets.len() {
-        return Err(inconsistent("the last layer does not give one value per target"));
+    if !config.layers.is_empty() && Some(width) != config.output_steps.checked_mul(config.targets.len()) {
+        return Err(inconsistent(
+            "the last layer does not give one value per target and estimated sample",
+        ));
+    }
+    if config.output_steps == 0
+        || config.output_steps > config.window_steps
+        || (config.output_steps > 1 && config.linear_skip)
+    {
+        return Err(inconsistent(
+            "a network estimates one sample, or, without a linear map, several of its window",
+        ));
     }
     if config.layers.is_empty() && !config.linear_skip {
         return Err(inconsistent("a model needs layers or a linear map"));

@@ -160,6 +160,11 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
         }
     }
     x = graph.cast(&x, DOUBLE);
+    let all = x.clone();
+    let (steps, targets) = (config.output_steps, config.targets.len());
+    if steps > 1 {
+        x = graph.columns("last_step", &x, (steps - 1) * targets, targets);
+    }
     if let Some(skip) = &weights.skip {
         let linear = graph.skip(config, skip, &rounded, window_values);
         x = if config.layers.is_empty() {
@@ -171,7 +176,6 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
     if let Some((guard, guide)) = config.guard.as_ref().zip(weights.guard.as_ref()) {
         x = graph.limit(guard, guide, &config.targets, &window, &x);
     }
-    graph.unscale_outputs(&config.targets, &x);
     let names = |channels: &[ScaledChannel]| {
         channels
             .iter()
@@ -179,6 +183,19 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
             .collect::<Vec<_>>()
             .join(", ")
     };
+    graph.unscale_outputs(&config.targets, &x);
+    let mut output = vec![value_info("estimates", &names(&config.targets), &[targets])];
+    if steps > 1 {
+        graph.all_steps(config, &all);
+        output.push(value_info(
+            "all_steps",
+            &format!(
+                "the last {steps} samples of the window, oldest first: {}",
+                names(&config.targets)
+            ),
+            &[steps, targets],
+        ));
+    }
     let proto = ModelProto {
         ir_version: IR_VERSION,
         producer_name: "hydroflex".to_owned(),
@@ -200,11 +217,7 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
                 &names(&config.inputs),
                 &[config.window_steps, config.inputs.len()],
             )],
-            output: vec![value_info(
-                "estimates",
-                &names(&config.targets),
-                &[config.targets.len()],
-            )],
+            output,
         }),
     };
     proto.encode_to_vec()
@@ -275,6 +288,28 @@ impl Graph {
         let centred = self.node("Sub", &[&window, &offset], Vec::new());
         let scaled = self.node("Div", &[&centred, &scale], Vec::new());
         self.node("Reshape", &[&scaled, &shape], Vec::new())
+    }
+
+    /// Every estimated sample, held within the range of its target.
+    fn all_steps(&mut self, config: &ModelConfig, x: &str) {
+        let shape = [-1, to_i64(config.output_steps), to_i64(config.targets.len())]
+            .iter()
+            .flat_map(|d: &i64| d.to_le_bytes())
+            .collect();
+        let shape = self.constant("all_steps_shape", INT64, &[3], shape);
+        let mut x = self.node("Reshape", &[x, &shape], Vec::new());
+        let targets = &config.targets;
+        let scale = self.doubles("all_steps_scale", targets.iter().map(|c| c.scale));
+        let offset = self.doubles("all_steps_offset", targets.iter().map(|c| c.offset));
+        x = self.node("Mul", &[&x, &scale], Vec::new());
+        x = self.node("Add", &[&x, &offset], Vec::new());
+        if let Some(guard) = &config.guard {
+            let low = self.doubles("all_steps_low", guard.min.iter().copied());
+            let high = self.doubles("all_steps_high", guard.max.iter().copied());
+            x = self.node("Max", &[&x, &low], Vec::new());
+            x = self.node("Min", &[&x, &high], Vec::new());
+        }
+        self.named_node("Identity", &[&x], Vec::new(), "all_steps".to_owned());
     }
 
     fn cast(&mut self, x: &str, data_type: i32) -> String {

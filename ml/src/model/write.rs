@@ -140,7 +140,7 @@ fn to_json(config: &ModelConfig) -> Vec<u8> {
 fn final_layers(problem: &Problem) -> Vec<DenseLayer> {
     problem.structure.layers(
         problem.steps * problem.spec.inputs.len(),
-        problem.spec.targets.len(),
+        problem.output_steps * problem.spec.targets.len(),
     )
 }
 
@@ -455,6 +455,7 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         sample_time_s,
         inputs: problem.input_scaling.channels().to_vec(),
         targets: problem.target_scaling.channels().to_vec(),
+        output_steps: problem.output_steps,
         linear_skip: problem.structure.linear_skip,
         input_limits: problem.input_limits.clone(),
         schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),

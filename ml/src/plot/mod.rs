@@ -4,6 +4,7 @@
 
 pub mod axis;
 pub mod errors;
+pub mod profile;
 
 use crate::evaluate::table::{display_unit, significant};
 use crate::evaluate::{EvaluateError, Evaluation};

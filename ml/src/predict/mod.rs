@@ -35,6 +35,8 @@ pub struct Predictor {
     targets: Scaling,
     /// First to last; none when the skip is the whole model.
     layers: Vec<PackedLayer>,
+    /// The same for all estimated samples; none when that is one.
+    all_steps: Option<AllSteps>,
     skip: Option<SkipKernel>,
     guard: Option<GuardKernel>,
     /// Of the values of a panel.
@@ -49,6 +51,15 @@ struct EnvelopeKernel {
     groups: Vec<EnvelopeGroup>,
     min: Vec<f64>,
     max: Vec<f64>,
+}
+
+/// A network that estimates several samples at once.
+#[derive(Debug, Clone, PartialEq)]
+struct AllSteps {
+    steps: usize,
+    layers: Vec<PackedLayer>,
+    /// Smallest and largest estimate of each target.
+    limits: Vec<[f64; 2]>,
 }
 
 /// Scaled windows.
@@ -121,6 +132,25 @@ fn fold(config: &ModelConfig, weights: &Weights) -> Vec<(Vec<Activation>, Linear
     folded
 }
 
+/// The weights of a network that estimates several samples at once, without those of all samples but the last.
+fn last_step(config: &ModelConfig, weights: &Weights) -> Weights {
+    let targets = config.targets.len();
+    let mut own = weights.clone();
+    if let Some(last) = own.layers.last_mut() {
+        let inputs = last.weight.len() / last.bias.len().max(1);
+        last.bias.drain(..last.bias.len() - targets);
+        last.weight.drain(..last.weight.len() - targets * inputs);
+    }
+    own
+}
+
+fn packed(config: &ModelConfig, weights: &Weights) -> Vec<PackedLayer> {
+    fold(config, weights)
+        .iter()
+        .map(|(activations, map)| PackedLayer::new(map, activations))
+        .collect()
+}
+
 #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
 fn compose(first: &LinearWeights, second: &LinearWeights, inputs: usize) -> LinearWeights {
     let inner = first.bias.len();
@@ -146,10 +176,27 @@ impl Predictor {
     /// Packs a model's weights.
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
-        let layers: Vec<PackedLayer> = fold(config, weights)
-            .iter()
-            .map(|(activations, map)| PackedLayer::new(map, activations))
-            .collect();
+        let several = config.output_steps > 1;
+        let layers = if several {
+            packed(config, &last_step(config, weights))
+        } else {
+            packed(config, weights)
+        };
+        let all_steps = several.then(|| AllSteps {
+            steps: config.output_steps,
+            layers: packed(config, weights),
+            limits: config.guard.as_ref().map_or_else(
+                || vec![[f64::NEG_INFINITY, f64::INFINITY]; config.targets.len()],
+                |guard| {
+                    guard
+                        .min
+                        .iter()
+                        .zip(&guard.max)
+                        .map(|(&low, &high)| [low, high])
+                        .collect()
+                },
+            ),
+        });
         let most = layers.iter().map(PackedLayer::inputs).max().unwrap_or(0);
         let most = most.max(config.window_steps * config.inputs.len());
         let skip = weights.skip.as_ref().map(|map| {
@@ -181,6 +228,7 @@ impl Predictor {
             maps: ScaleMap::new(config),
             targets: Scaling::from_config(&config.targets),
             layers,
+            all_steps,
             skip,
             guard,
             places: (0..most).map(|place| place * PANEL).collect(),
@@ -223,6 +271,47 @@ impl Predictor {
     #[must_use]
     pub fn has_intervals(&self) -> bool {
         self.intervals.len() == self.targets.len()
+    }
+
+    /// Samples that the network estimates at once.
+    #[must_use]
+    pub fn output_steps(&self) -> usize {
+        self.all_steps.as_ref().map_or(1, |all| all.steps)
+    }
+
+    /// Estimates of the last [`Self::output_steps`] samples of one window, oldest first, a row of targets each, in the
+    /// columns' units: what a network that estimates several samples gives at once, held within the range of each target.
+    /// [`Self::predict_window`] gives the last row, bounded more closely.
+    ///
+    /// # Panics
+    /// When the window has another length.
+    #[must_use]
+    pub fn predict_all_steps(&self, window: &[f64], workspace: &mut Workspace) -> Vec<f64> {
+        assert_eq!(window.len(), self.window_len(), "values of a window");
+        let targets = self.targets.len();
+        let Some(all) = &self.all_steps else {
+            let mut out = vec![0.0; targets];
+            self.predict_window(window, &mut out, workspace);
+            return out;
+        };
+        let mut x = std::mem::take(&mut workspace.window);
+        self.maps.scale(window, &mut x);
+        let mut values = x[..window.len()].to_vec();
+        workspace.window = x;
+        for layer in &all.layers {
+            let mut out = vec![0.0; layer.padded()];
+            layer.forward(&values, values.len(), 1, &mut out);
+            values = out;
+        }
+        values[..all.steps * targets]
+            .iter()
+            .enumerate()
+            .map(|(place, &value)| {
+                let target = place % targets;
+                let [low, high] = all.limits[target];
+                self.targets.unscale(target, f64::from(value)).clamp(low, high)
+            })
+            .collect()
     }
 
     /// Scratch memory for one thread.

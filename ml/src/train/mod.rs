@@ -99,6 +99,26 @@ pub enum TrainError {
         /// Value.
         value: f64,
     },
+    /// Several samples at once from a network that gives one.
+    #[error(
+        "output_steps is above 1: structure {structure:?} estimates one sample; give letters such as RLR"
+    )]
+    SingleStep {
+        /// Structure.
+        structure: String,
+    },
+    /// A rate for a dropout that is not there.
+    #[error("dropout is given, but structure {structure:?} has no letter D")]
+    NoDropout {
+        /// Structure.
+        structure: String,
+    },
+    /// Not a part of a whole.
+    #[error("dropout must be at least 0 and below 1, it is {value}")]
+    NoPart {
+        /// Value.
+        value: f64,
+    },
     /// The data set does not say how long a window is.
     #[error(
         "the data set does not tell the window length by this rule (no settling runs, or none that settles); give the window in seconds"
@@ -334,13 +354,16 @@ impl<'a> Trainer<'a> {
         Self {
             problem,
             network: match problem.structure.form {
-                Form::Dense => Network::Own(Box::new(Step::new(
-                    &problem.layers,
-                    &problem.whitening,
-                    problem.steps * problem.train.series.width,
-                    problem.recipe.batch,
-                    problem.loss,
-                ))),
+                Form::Dense => {
+                    let step = Step::new(
+                        &problem.layers,
+                        &problem.whitening,
+                        problem.steps * problem.train.series.width,
+                        problem.recipe.batch,
+                        problem.loss,
+                    );
+                    Network::Own(Box::new(step.with_dropout(&problem.structure.dropouts())))
+                }
                 _ => Network::Burn(comparison::autodiff(problem)),
             },
             train_rows: step::first_rows(&problem.train),
@@ -432,6 +455,7 @@ fn epoch(
     let mut sum = 0.0;
     let mut seen = 0_usize;
     let mut reported = Instant::now();
+    let drops = problem.structure.dropouts().contains(&true);
     for (index, batch) in order.chunks(problem.recipe.batch).enumerate() {
         let elapsed_s = clock.elapsed_s();
         let fraction = limits.fraction(state, number, index, elapsed_s);
@@ -439,6 +463,12 @@ fn epoch(
             break; // The time limit fell into this epoch.
         }
         let rate = limits.rate(fraction);
+        if let Network::Own(step) = &mut trainer.network
+            && drops
+        {
+            let seed = step::dropout_seed(problem.recipe.seed, number, index);
+            step.leave_out(problem.recipe.dropout, seed);
+        }
         let loss = trainer
             .network
             .gradient(samples, &state.parameters, batch, &mut trainer.gradient);

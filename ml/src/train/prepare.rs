@@ -32,6 +32,9 @@ const LEARNING_RATE: f64 = 1e-3;
 /// Our batch.
 const BATCH: usize = 1024;
 
+/// Part of the values that dropout leaves out by default: ours, the paper names none.
+const DROPOUT: f64 = 0.1;
+
 /// Whitening keeps directions whose variance exceeds this part of the largest …
 const WHITENING_CUT: f64 = 1e-9;
 /// … and divides by the root of variance plus this part of the largest, so that directions that
@@ -76,6 +79,8 @@ pub struct Recipe {
     pub loss_threshold: Option<f64>,
     /// Seed.
     pub seed: u64,
+    /// Part of the values that dropout leaves out.
+    pub dropout: f64,
 }
 
 /// Windows of one part of the runs with what the network shall say at their ends.
@@ -101,6 +106,8 @@ pub struct Problem {
     pub structure: Structure,
     /// Samples in a window.
     pub steps: usize,
+    /// Samples that are estimated at once.
+    pub output_steps: usize,
     /// Scales of the inputs.
     pub input_scaling: Scaling,
     /// Scales of the targets.
@@ -221,11 +228,29 @@ impl Problem {
         let seen = noisy(&train_inputs, SEEN_STREAM);
         let validation_inputs = noisy(&validation_inputs, SEEN_STREAM + 1);
         let published = spec.windows == WindowCut::Disjoint;
-        let steps = match spec.window {
+        let window = match spec.window {
             WindowRule::Given { window_s } => window_steps(window_s, data.train.sample_time_s)?,
             _ => return Err(TrainError::NoWindow),
         };
-        let structure = Structure::parse_any(&spec.structure, steps, spec.width)?;
+        let width = spec.width.or(spec.width_windows.map(|times| times * window));
+        let structure = Structure::parse_any(&spec.structure, window, width)?;
+        let output_steps = spec.output_steps.unwrap_or(1);
+        if output_steps > 1 && (structure.linear_skip || structure.form != Form::Dense) {
+            return Err(TrainError::SingleStep {
+                structure: structure.name,
+            });
+        }
+        if spec.dropout.is_some() && !structure.dropouts().contains(&true) {
+            return Err(TrainError::NoDropout {
+                structure: structure.name,
+            });
+        }
+        // Every sample that is estimated has the whole window before it.
+        let steps = if output_steps > 1 {
+            window + output_steps
+        } else {
+            window
+        };
 
         let scaling: fn(&Runs) -> Scaling = if published { Scaling::paper } else { Scaling::fit };
         let (input_scaling, target_scaling) = (scaling(&seen), scaling(&train_targets));
@@ -277,7 +302,7 @@ impl Problem {
                 sample(&train, &every),
                 sample(&validation, &validation.windows),
                 &input_scaling,
-                &slow_inputs(&train_inputs),
+                &slow_inputs(&train_inputs, &spec.follow)?,
                 noise_covariance.as_ref(),
             )?)
         } else {
@@ -309,12 +334,13 @@ impl Problem {
             0 => window_values,
             components => components,
         };
-        let layers = structure.layers(first_inputs, spec.targets.len());
+        let layers = structure.layers(first_inputs, output_steps * spec.targets.len());
         let recipe = recipe(&spec, published, data.train.runs.len(), train.windows.len());
         let parameters = initial_parameters(&layers, spec.seed, 1.0);
         Ok(Self {
             spec,
             steps,
+            output_steps,
             input_scaling,
             target_scaling,
             train,
@@ -419,7 +445,15 @@ fn check_names(spec: &TrainingSpec) -> Result<(), TrainError> {
             return Err(TrainError::NotPositive { what, value });
         }
     }
-    for (what, value) in [("epochs", spec.epochs), ("batch", spec.batch)] {
+    if let Some(value) = spec.dropout.filter(|part| !(0.0..1.0).contains(part)) {
+        return Err(TrainError::NoPart { value });
+    }
+    for (what, value) in [
+        ("epochs", spec.epochs),
+        ("batch", spec.batch),
+        ("output_steps", spec.output_steps),
+        ("width_windows", spec.width_windows),
+    ] {
         if value == Some(0) {
             return Err(TrainError::NotPositive { what, value: 0.0 });
         }
@@ -459,8 +493,11 @@ fn sample<'a>(part: &'a Part, windows: &'a Windows) -> Sample<'a> {
     }
 }
 
-/// Inputs that tell the pose: lengths of cylinders, else angles.
-fn slow_inputs(inputs: &Runs) -> Vec<usize> {
+/// Inputs that are named, or that tell the pose: lengths of cylinders, else angles.
+fn slow_inputs(inputs: &Runs, follow: &[String]) -> Result<Vec<usize>, TrainError> {
+    if !follow.is_empty() {
+        return Ok(inputs.positions(follow)?);
+    }
     let named = |prefix: &str| -> Vec<usize> {
         inputs
             .channels
@@ -471,11 +508,11 @@ fn slow_inputs(inputs: &Runs) -> Vec<usize> {
             .collect()
     };
     let lengths = named("length_");
-    if lengths.is_empty() {
+    Ok(if lengths.is_empty() {
         named("angle_")
     } else {
         lengths
-    }
+    })
 }
 
 /// The training range of each input, widened as the slow signals' is.
@@ -496,18 +533,19 @@ fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
 }
 
 /// What the skip leaves over of the scaled targets, row by row; the targets themselves without one.
-/// Rows that end no window are 0.
+/// Rows that end no window are 0 where there is a skip.
 fn skip_errors(part: &Part, steps: usize, skip: Option<&ScheduledMap>, scaling: &Scaling) -> Vec<f64> {
+    let Some(map) = skip else {
+        return part.targets.values.clone();
+    };
     let width = part.targets.width;
     let mut errors = vec![0.0; part.targets.values.len()];
     let estimates: Vec<Vec<f64>> = (0..part.windows.len())
         .into_par_iter()
         .map(|index| {
             let mut estimate = vec![0.0; width];
-            if let Some(map) = skip {
-                let window = part.series.window(part.windows.first_row(index), steps);
-                map.apply(scaling, window, &mut estimate);
-            }
+            let window = part.series.window(part.windows.first_row(index), steps);
+            map.apply(scaling, window, &mut estimate);
             estimate
         })
         .collect();
@@ -584,5 +622,6 @@ fn recipe(spec: &TrainingSpec, published: bool, runs: usize, windows: usize) -> 
         batch,
         loss_threshold: published.then_some(PAPER_LOSS_THRESHOLD),
         seed: spec.seed,
+        dropout: spec.dropout.unwrap_or(DROPOUT),
     }
 }

@@ -9,7 +9,7 @@ use crate::transition::ATTEMPT_LIMIT;
 use crate::{Created, Ledger, LedgerError, clock};
 use hydroflex_openapi::catalogue::FileEntry;
 use hydroflex_openapi::event::EventKind;
-use hydroflex_openapi::id::{DatasetId, JobId, ModelId, TrainingId};
+use hydroflex_openapi::id::{DatasetId, JobId, ModelId, SweepId, TrainingId};
 use hydroflex_openapi::job::{JobSpec, TrainingSpec};
 use hydroflex_openapi::status::{JobState, TrainingProgress};
 
@@ -52,19 +52,22 @@ pub struct TrainingClaim {
     pub dataset: DatasetRecord,
 }
 
-async fn insert_training(
+/// `sweep`: the sweep that the training is a cell of.
+pub(crate) async fn insert_training(
     tx: &mut Transaction,
     job: Option<JobId>,
+    sweep: Option<SweepId>,
     dataset: &DatasetId,
     spec: &TrainingSpec,
 ) -> Result<TrainingId, LedgerError> {
     let id = TrainingId::generate();
     tx.execute(
-        "INSERT INTO trainings (id, job_id, dataset_id, spec, state, created_ms) \
-         VALUES ($1, $2, $3, $4, 'open', $5)",
+        "INSERT INTO trainings (id, job_id, sweep_id, dataset_id, spec, state, created_ms) \
+         VALUES ($1, $2, $3, $4, $5, 'open', $6)",
         values![
             id.to_string(),
             job.map(|job| job.to_string()),
+            sweep.map(|sweep| sweep.to_string()),
             dataset.as_str(),
             serde_json::to_string(spec)?,
             clock::now_ms(),
@@ -155,7 +158,7 @@ impl Ledger {
         };
         append(&mut tx, job, &event).await?;
         for spec in trainings {
-            insert_training(&mut tx, Some(job), &dataset.id, spec).await?;
+            insert_training(&mut tx, Some(job), None, &dataset.id, spec).await?;
         }
         advance(
             &mut tx,
@@ -218,7 +221,7 @@ impl Ledger {
         key: Option<&IdempotencyKey>,
     ) -> Result<Created<TrainingId>, LedgerError> {
         let mut tx = self.pool.begin().await?;
-        let id = insert_training(&mut tx, None, dataset, spec).await?;
+        let id = insert_training(&mut tx, None, None, dataset, spec).await?;
         if let Some(key) = key
             && let Some(before) = claim_key(&mut tx, key, &id.to_string()).await?
         {
@@ -260,7 +263,7 @@ impl Ledger {
             .collect()
     }
 
-    /// Takes the next training. `None` if there is none, or the trainer has been given up.
+    /// Takes the next training, cells of sweeps after all others. `None` if there is none, or the trainer has been given up.
     ///
     /// # Errors
     /// Passes on what the database says.
@@ -277,12 +280,12 @@ impl Ledger {
         let statement = match self.engine() {
             Engine::Sqlite => {
                 "UPDATE trainings SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', \
-                 worker = $1 WHERE id = (SELECT id FROM trainings WHERE state = 'open' ORDER BY id LIMIT 1) \
+                 worker = $1 WHERE id = (SELECT id FROM trainings WHERE state = 'open' ORDER BY sweep_id IS NOT NULL, id LIMIT 1) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
             }
             Engine::Postgres => {
                 "UPDATE trainings SET epoch = epoch + 1, attempt = attempt + 1, state = 'running', \
-                 worker = $1 WHERE id = (SELECT id FROM trainings WHERE state = 'open' ORDER BY id LIMIT 1 \
+                 worker = $1 WHERE id = (SELECT id FROM trainings WHERE state = 'open' ORDER BY sweep_id IS NOT NULL, id LIMIT 1 \
                  FOR UPDATE SKIP LOCKED) \
                  AND EXISTS (SELECT 1 FROM workers WHERE name = $1 AND state = 'alive') RETURNING *"
             }

@@ -5,7 +5,7 @@
 //!
 //! - `transition`: the life of a shard as a pure function
 //! - `engine`: SQLite and PostgreSQL behind one small surface
-//! - `jobs`, `shards`, `workers`, `artefacts`, `aliases`, `events`: what can be done, one transaction each
+//! - `jobs`, `shards`, `workers`, `artefacts`, `sweeps`, `aliases`, `events`: what can be done, one transaction each
 //! - `keys`: who may use the REST interface
 //! - `blobs`: objects in a directory, or in S3 (`s3`) over TLS (`tls`)
 //! - `crash`: places where tests let a process die
@@ -21,6 +21,7 @@ mod jobs;
 mod shards;
 mod workers;
 mod artefacts;
+mod sweeps;
 pub mod orphans;
 mod aliases;
 mod events;
@@ -39,17 +40,19 @@ pub use error::LedgerError;
 pub use jobs::{Created, IdempotencyKey, NewJob};
 pub use record::{DatasetRecord, JobRecord, ModelRecord, ShardRecord, TrainingRecord};
 pub use shards::{Claim, CommitOutcome, ShardKind, ShardResult};
+pub use sweeps::{SweepCellRecord, SweepRecord};
 pub use workers::Beat;
 
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 6] = [
+const SCHEMA: [&str; 7] = [
     include_str!("../migrations/0001_ledger.sql"),
     include_str!("../migrations/0002_aliases.sql"),
     include_str!("../migrations/0003_keys.sql"),
     include_str!("../migrations/0004_instruction_sets.sql"),
     include_str!("../migrations/0005_uploads.sql"),
+    include_str!("../migrations/0006_sweeps.sql"),
     include_str!("../migrations/0007_rounds.sql"),
 ];
 

@@ -6,7 +6,7 @@ use hydroflex_ml::dataset::evaluation_runs;
 use hydroflex_ml::evaluate::evaluate;
 use hydroflex_ml::evaluate::table::{PUBLISHED, table};
 use hydroflex_ml::model::Model;
-use hydroflex_ml::plot::of_run;
+use hydroflex_ml::plot::{of_run, profile};
 use hydroflex_openapi::model::EvaluationReport;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -23,7 +23,13 @@ pub struct Args {
     /// Write a picture (SVG) of one run: reference, estimate and error over time
     #[arg(long)]
     pub plot: Option<PathBuf>,
-    /// Run of the picture (default: the first)
+    /// Write a picture (SVG) of where the errors stand: over time, amplitude and frequency, with the learning curve
+    #[arg(long)]
+    pub profile: Option<PathBuf>,
+    /// Target of that picture (default: the model's first)
+    #[arg(long, requires = "profile")]
+    pub target: Option<String>,
+    /// Run of the picture of one run (default: the first)
     #[arg(long)]
     pub run: Option<u64>,
     /// Print machine-readable metrics
@@ -58,6 +64,19 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         );
         let picture = of_run(&model, &runs, &evaluation, run, &title)?;
         std::fs::write(path, picture.to_svg()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    if let Some(path) = &args.profile {
+        let targets = &model.config().targets;
+        let target = match &args.target {
+            Some(name) => targets.iter().position(|t| t.name == *name).with_context(|| {
+                let names: Vec<&str> = targets.iter().map(|t| t.name.as_str()).collect();
+                format!("--target is {name:?}, allowed is one of {}", names.join(", "))
+            })?,
+            None => 0,
+        };
+        let title = format!("{}: where the errors stand", machine_title(&dataset));
+        let svg = profile::of_target(&model, &evaluation, target, &title);
+        std::fs::write(path, svg).with_context(|| format!("cannot write {}", path.display()))?;
     }
     if args.json {
         return super::print_json(&evaluation.report);

@@ -11,6 +11,7 @@ pub mod worker;
 pub mod simulate;
 pub mod machine;
 pub mod job;
+pub mod sweep;
 pub mod rerun;
 pub mod reproduce;
 pub mod dataset;

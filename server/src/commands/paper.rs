@@ -15,6 +15,7 @@ use hydroflex_ml::dataset::load_all;
 use hydroflex_ml::evaluate::faults::fault_rates;
 use hydroflex_ml::evaluate::{EvaluateError, evaluate, with_noise_of_training};
 use hydroflex_ml::model::Model;
+use hydroflex_ml::plot::profile;
 use hydroflex_ml::runs::Runs;
 use hydroflex_ml::structure::Structure;
 use hydroflex_ml::train::comparison::Comparison;
@@ -23,6 +24,7 @@ use hydroflex_openapi::job::{
     Excitation, JobSpec, NoiseLevel, NoiseSpec, TrainingSpec, ValueOrRange, WindowCut, WindowRule,
 };
 use hydroflex_openapi::model::{EvaluationReport, FaultRate};
+use hydroflex_openapi::sweep;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
@@ -37,10 +39,12 @@ const SAMPLE_S: f64 = 0.005;
 const EVALUATION_S: f64 = 10.0;
 /// Start of the published evaluation cycle, degrees.
 const CYCLE_ANGLE_DEG: f64 = 18.24;
-/// Random 10 s runs simulated, so that enough of them stay within stroke and pressures.
+/// Random 10 s runs simulated, at least and for each one whose errors are reported, so that enough of them stay
+/// within stroke and pressures. Intervals, envelope and faults take all that do.
 const RANDOM_CANDIDATES: u64 = 40;
-/// Those whose errors are reported: the first ones without a flag. Intervals, envelope and faults take all without.
-const RANDOM_EVALUATED: usize = 5;
+const CANDIDATES_PER_SIGNAL: u64 = 8;
+/// Signals whose errors are reported by default.
+const DEFAULT_SIGNALS: u64 = 5;
 /// Random 10 s runs of which those without a flag calibrate.
 const CALIBRATION_CANDIDATES: u64 = 128;
 /// Added to the study's seed for the calibration runs.
@@ -91,12 +95,21 @@ pub struct Args {
     /// Added to the seed for the evaluation, which shares no run with the training; another one judges anew
     #[arg(long, default_value_t = 1_000_003)]
     pub evaluation_seed: u64,
+    /// Random 10 s signals whose errors are reported: the first ones that stay within stroke and pressures
+    #[arg(long, default_value_t = DEFAULT_SIGNALS, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub signals: u64,
     /// Sensor noise to train and evaluate with, separated by commas: `none`, `crane`
     #[arg(long, value_enum, value_delimiter = ',', default_value = "none")]
     pub noise: Vec<NoiseChoice>,
     /// Also train networks on random payloads over the range of --payloads, as many runs as all payloads together
     #[arg(long)]
     pub mixed: bool,
+    /// Part of these runs that carry exactly nothing, where the machine has other modes than with the smallest payload
+    #[arg(long, default_value_t = 0.0, requires = "mixed")]
+    pub mixed_empty: f64,
+    /// Inputs that the coefficients of the linear map of these networks follow, separated by commas (default: lengths)
+    #[arg(long, value_delimiter = ',', requires = "mixed")]
+    pub mixed_follow: Vec<String>,
     /// Largest number of epochs of a training
     #[arg(long)]
     pub epochs: Option<usize>,
@@ -172,15 +185,19 @@ pub enum SensorSet {
 }
 
 impl SensorSet {
+    fn set(self) -> sweep::SensorSet {
+        match self {
+            Self::All => sweep::SensorSet::All,
+            Self::Usp => sweep::SensorSet::Usp,
+            Self::Usdp2 => sweep::SensorSet::Usdp2,
+            Self::Usd => sweep::SensorSet::Usd,
+            Self::Us => sweep::SensorSet::Us,
+        }
+    }
+
     /// How the paper writes it.
     fn label(self) -> &'static str {
-        match self {
-            Self::All => "U s ds p1 p2",
-            Self::Usp => "U s p1 p2",
-            Self::Usdp2 => "U s ds p2",
-            Self::Usd => "U s ds",
-            Self::Us => "U s",
-        }
+        self.set().label()
     }
 
     fn name(self) -> &'static str {
@@ -195,36 +212,17 @@ impl SensorSet {
 
     /// Channels of a data set that belong to it.
     fn channels(self, dataset: &Dataset) -> Vec<String> {
-        let wanted: &[fn(&str) -> bool] = match self {
-            Self::All => &[is_valve, is_length, is_velocity, is_pressure],
-            Self::Usp => &[is_valve, is_length, is_pressure],
-            Self::Usdp2 => &[is_valve, is_length, is_velocity, is_rod_pressure],
-            Self::Usd => &[is_valve, is_length, is_velocity],
-            Self::Us => &[is_valve, is_length],
-        };
         dataset
             .channels()
             .iter()
             .map(|channel| channel.name.clone())
-            .filter(|name| wanted.iter().any(|is| is(name)))
+            .filter(|name| self.set().has(name))
             .collect()
     }
 }
 
-fn is_valve(name: &str) -> bool {
-    name.starts_with("valve_")
-}
-fn is_length(name: &str) -> bool {
-    name.starts_with("length_")
-}
-fn is_velocity(name: &str) -> bool {
-    name.starts_with("velocity_")
-}
-fn is_pressure(name: &str) -> bool {
-    name.starts_with("pressure_")
-}
-fn is_rod_pressure(name: &str) -> bool {
-    is_pressure(name) && name.ends_with("_rod_pa")
+fn default_signals() -> u64 {
+    DEFAULT_SIGNALS
 }
 
 /// One trained network and what it is worth on one payload.
@@ -232,6 +230,9 @@ fn is_rod_pressure(name: &str) -> bool {
 struct Cell {
     /// Of the evaluation.
     payload_kg: f64,
+    /// Random signals asked for.
+    #[serde(default = "default_signals")]
+    signals: u64,
     /// Of the training runs.
     trained: Payload,
     sensors: SensorSet,
@@ -311,6 +312,11 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
         shorten(&mut args);
     }
     ensure!(args.runs >= 8, "--runs is {}, allowed is 8 or more", args.runs);
+    ensure!(
+        (0.0..1.0).contains(&args.mixed_empty),
+        "--mixed-empty is {}, allowed is 0 or more, below 1",
+        args.mixed_empty
+    );
     ensure!(args.seeds >= 1, "--seeds is 0, allowed is 1 or more");
     for payload in &args.payloads {
         ensure!(
@@ -422,8 +428,25 @@ fn training_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow
     let count = runs + runs.div_ceil(4);
     let spec = job(args, payload, count, 1.0, 0)?;
     (0..count)
-        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
+        .map(|index| {
+            Ok(plan_run(
+                &of_run(args, payload, &spec, index),
+                file,
+                simulator,
+                index,
+            )?)
+        })
         .collect()
+}
+
+/// The job of run `index`: evenly spread runs of a range carry exactly nothing, if asked for.
+fn of_run(args: &Args, payload: Payload, spec: &JobSpec, index: u64) -> JobSpec {
+    let empty = |runs: u64| (runs as f64 * args.mixed_empty).floor();
+    let mut spec = spec.clone();
+    if matches!(payload, Payload::Range { .. }) && empty(index + 1) > empty(index) {
+        spec.payload_kg = ValueOrRange::Value(0.0);
+    }
+    spec
 }
 
 /// Random runs of 10 s.
@@ -437,8 +460,20 @@ fn random_runs(
     let file = simulator.machine().file();
     let spec = job(args, payload, count, EVALUATION_S, seed)?;
     (0..count)
-        .map(|index| Ok(plan_run(&spec, file, simulator, index)?))
+        .map(|index| {
+            Ok(plan_run(
+                &of_run(args, payload, &spec, index),
+                file,
+                simulator,
+                index,
+            )?)
+        })
         .collect()
+}
+
+/// Random runs simulated for the evaluation.
+fn candidates(args: &Args) -> u64 {
+    RANDOM_CANDIDATES.max(CANDIDATES_PER_SIGNAL * args.signals)
 }
 
 /// Run 0 is the published cycle; random signals of the same length follow.
@@ -447,7 +482,7 @@ fn evaluation_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyh
     let mut spec = job(
         args,
         payload,
-        RANDOM_CANDIDATES + 1,
+        candidates(args) + 1,
         EVALUATION_S,
         args.evaluation_seed,
     )?;
@@ -455,7 +490,7 @@ fn evaluation_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyh
         args,
         simulator,
         payload,
-        RANDOM_CANDIDATES + 1,
+        candidates(args) + 1,
         args.evaluation_seed,
     )?;
     spec.excitation = Excitation::Cycle;
@@ -540,6 +575,10 @@ impl Study<'_> {
             window: WindowRule::Given {
                 window_s: steps as f64 * SAMPLE_S,
             },
+            follow: match payload {
+                Payload::Range { .. } if structure == "best" => self.args.mixed_follow.clone(),
+                _ => Vec::new(),
+            },
             seed,
             // The published length belongs to the published way.
             epochs: self.args.epochs.filter(|_| recipe == Recipe::Ours),
@@ -566,7 +605,7 @@ impl Study<'_> {
             };
             return self.comparison(asked, &evaluated);
         }
-        if let Some(cells) = finished(&path, training, &spec, &evaluated) {
+        if let Some(cells) = finished(&path, training, &spec, &evaluated, self.args.signals) {
             return Ok(cells);
         }
         let model_dir = folder.join(&name);
@@ -591,12 +630,17 @@ impl Study<'_> {
         let model = Model::load(&model_dir)?;
         let mut cells = Vec::new();
         for (payload_kg, evaluation) in evaluated {
-            let runs = parts_for(&model, evaluation, seed)
+            let runs = parts_for(&model, evaluation, seed, self.args.signals)
                 .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
             let sha256 = evaluation.dataset_sha256();
             let report = |runs: &Runs| anyhow::Ok(evaluate(&model, runs, sha256)?.report);
+            let random = evaluate(&model, &runs.random, sha256)?;
+            let picture = folder.join(format!("{name}-at-{payload_kg}-kg.svg"));
+            let svg = profile::of_target(&model, &random, 0, &format!("{name} at {payload_kg} kg"));
+            std::fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
             let cell = Cell {
                 payload_kg,
+                signals: self.args.signals,
                 trained: *payload,
                 sensors,
                 structure: structure.to_owned(),
@@ -608,7 +652,7 @@ impl Study<'_> {
                 parameters: summary.parameters,
                 train_seconds: summary.train_seconds,
                 cycle: report(&runs.cycle)?,
-                random: report(&runs.random)?,
+                random: random.report,
                 calm: report(&runs.calm)?,
                 flagged: (!runs.flagged.runs.is_empty())
                     .then(|| report(&runs.flagged))
@@ -659,7 +703,7 @@ impl Study<'_> {
             name,
         } = asked;
         let path = folder.join(format!("{name}.json"));
-        if let Some(cells) = compared(&path, training, &spec, evaluated) {
+        if let Some(cells) = compared(&path, training, &spec, evaluated, self.args.signals) {
             return Ok(cells);
         }
         let bar = super::train::training_bar(self.args.json);
@@ -676,11 +720,12 @@ impl Study<'_> {
         let mut cells = Vec::new();
         for &(payload_kg, evaluation) in evaluated {
             let noisy = |runs: &Runs| network.with_noise_of_training(runs, spec.seed);
-            let runs = evaluation_parts(&network.channels(), evaluation, &noisy)
+            let runs = evaluation_parts(&network.channels(), evaluation, self.args.signals, &noisy)
                 .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
             let report = |runs: &Runs| network.evaluate(runs, evaluation.dataset_sha256());
             let cell = Cell {
                 payload_kg,
+                signals: self.args.signals,
                 trained: *payload,
                 sensors,
                 structure: spec.structure.clone(),
@@ -720,7 +765,7 @@ impl Study<'_> {
             if let (Payload::Fixed(kg), Some(evaluation)) = (set.payload, &set.evaluation)
                 && kg.to_bits() != own.to_bits()
             {
-                let runs = parts_for(model, evaluation, seed)?.calm;
+                let runs = parts_for(model, evaluation, seed, self.args.signals)?.calm;
                 let inside = evaluate(model, &runs, evaluation.dataset_sha256())?
                     .report
                     .inside_envelope;
@@ -739,11 +784,16 @@ struct EvaluationParts {
     flagged: Runs,
 }
 
-fn parts_for(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::Result<EvaluationParts> {
+fn parts_for(
+    model: &Model,
+    evaluation: &Dataset,
+    seed: u64,
+    signals: u64,
+) -> anyhow::Result<EvaluationParts> {
     let config = model.config();
     let channels = config.inputs.iter().chain(&config.targets);
     let names: Vec<String> = channels.map(|c| c.name.clone()).collect();
-    evaluation_parts(&names, evaluation, &|runs| {
+    evaluation_parts(&names, evaluation, signals, &|runs| {
         with_noise_of_training(model, runs, seed)
     })
 }
@@ -752,6 +802,7 @@ fn parts_for(model: &Model, evaluation: &Dataset, seed: u64) -> anyhow::Result<E
 fn evaluation_parts(
     names: &[String],
     evaluation: &Dataset,
+    signals: u64,
     noisy: &dyn Fn(&Runs) -> Result<Runs, EvaluateError>,
 ) -> anyhow::Result<EvaluationParts> {
     let all = noisy(&load_all(evaluation, names)?)?;
@@ -770,13 +821,18 @@ fn evaluation_parts(
     let calm = |id| id > 0 && is_calm(id);
     let parts = EvaluationParts {
         cycle: part(&|id| id == 0, 1),
-        random: part(&calm, RANDOM_EVALUATED),
+        random: part(&calm, usize::try_from(signals).unwrap_or(usize::MAX)),
         calm: part(&calm, usize::MAX),
         flagged: part(&|id| id > 0 && !is_calm(id), usize::MAX),
     };
+    let (found, of) = (parts.calm.runs.len(), evaluation.runs().len().saturating_sub(1));
     ensure!(
-        !parts.random.runs.is_empty(),
-        "none of {RANDOM_CANDIDATES} random runs stays within stroke and pressures"
+        found > 0,
+        "none of {of} random runs stays within stroke and pressures"
+    );
+    ensure!(
+        signals <= DEFAULT_SIGNALS || found as u64 >= signals,
+        "--signals is {signals}, but only {found} of {of} random runs stay within stroke and pressures"
     );
     Ok(parts)
 }
@@ -787,11 +843,13 @@ fn compared(
     training: &Dataset,
     spec: &TrainingSpec,
     evaluated: &[(f64, &Dataset)],
+    signals: u64,
 ) -> Option<Vec<Cell>> {
     let cells: Vec<Cell> = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
     let matches = |(cell, (kg, evaluation)): (&Cell, &(f64, &Dataset))| {
         cell.payload_kg.to_bits() == kg.to_bits()
             && cell.spec == *spec
+            && cell.signals == signals
             && cell.trained_on.as_deref() == Some(training.dataset_sha256())
             && cell.cycle.dataset_sha256 == evaluation.dataset_sha256()
     };
@@ -804,6 +862,7 @@ fn finished(
     training: &Dataset,
     spec: &TrainingSpec,
     evaluated: &[(f64, &Dataset)],
+    signals: u64,
 ) -> Option<Vec<Cell>> {
     let model = Model::load(&path.with_extension("")).ok()?;
     let same = model.config().provenance.dataset_sha256 == training.dataset_sha256();
@@ -811,6 +870,7 @@ fn finished(
     let matches = |(cell, (kg, evaluation)): (&Cell, &(f64, &Dataset))| {
         cell.payload_kg.to_bits() == kg.to_bits()
             && cell.spec == *spec
+            && cell.signals == signals
             && cell.cycle.model_sha256 == model.sha256()
             && cell.cycle.dataset_sha256 == evaluation.dataset_sha256()
     };

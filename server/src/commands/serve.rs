@@ -21,6 +21,9 @@ pub struct Args {
     /// Local worker processes (default: one per core; 0 for none)
     #[arg(long)]
     pub workers: Option<usize>,
+    /// Local trainer processes, which share the cores: trainings that go on at once (0 for none)
+    #[arg(long, default_value_t = 1, env = "HYDROFLEX_TRAINERS")]
+    pub trainers: usize,
     /// Database URL: sqlite:PATH or postgres://USER@HOST/NAME (default: SQLite below --data)
     #[arg(long, env = "HYDROFLEX_DATABASE", hide_env_values = true)]
     pub database: Option<String>,
@@ -76,6 +79,7 @@ async fn serve(args: Args) -> anyhow::Result<()> {
     if let Some(workers) = args.workers {
         config.workers = workers;
     }
+    config.trainers = args.trainers;
     config.lease = Duration::from_secs(args.lease);
     config.limits = args.limits.limits();
     config.most_jobs = args.most_jobs;

@@ -24,7 +24,7 @@ pub struct Args {
     /// Directory to write the model to
     #[arg(long)]
     pub out: PathBuf,
-    /// `best`, or the letters of the paper: L, RLR, TLTLT, TLSLTLSLT, ELE, …
+    /// `best`, or the letters of the paper: L, RLR, TLTLT, TLSLTLSLT, ELE, …, RDLR (with dropout)
     #[arg(long, default_value = "best")]
     pub structure: String,
     /// Input channels, separated by commas
@@ -33,15 +33,24 @@ pub struct Args {
     /// Target channels, separated by commas
     #[arg(long, value_delimiter = ',')]
     pub targets: Vec<String>,
+    /// Inputs that the coefficients of `best`'s linear map follow, separated by commas (default: the cylinders' lengths)
+    #[arg(long, value_delimiter = ',')]
+    pub follow: Vec<String>,
     /// Window length in seconds (default: from the data set)
     #[arg(long)]
     pub window_s: Option<f64>,
     /// Seed of initial weights and batches
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// Width of the hidden layers (default: the number of window steps)
+    /// Samples that the network estimates at once, the last ones of its window (10, 15, 30 in the paper; default: one)
     #[arg(long)]
-    pub width: Option<usize>,
+    pub output_steps: Option<usize>,
+    /// Width of the hidden layers, or a multiple of the number of window steps, as 2w (default: 1w)
+    #[arg(long, value_parser = parse_width)]
+    pub width: Option<Width>,
+    /// Part of a layer's values that dropout (letter D) leaves out in training (default: 0.1)
+    #[arg(long)]
+    pub dropout: Option<f64>,
     /// Which windows of a run are trained on: `overlapping`, or `disjoint` as published
     #[arg(long, value_parser = parse_windows, default_value = "overlapping")]
     pub windows: WindowCut,
@@ -87,8 +96,18 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         window: args
             .window_s
             .map_or_else(WindowRule::default, |window_s| WindowRule::Given { window_s }),
+        follow: args.follow,
         seed: args.seed,
-        width: args.width,
+        output_steps: args.output_steps,
+        width: match args.width {
+            Some(Width::Values(width)) => Some(width),
+            _ => None,
+        },
+        width_windows: match args.width {
+            Some(Width::Windows(times)) => Some(times),
+            _ => None,
+        },
+        dropout: args.dropout,
         windows: args.windows,
         batch: args.batch,
         learning_rate: args.learning_rate,
@@ -124,6 +143,23 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         return super::print_json(&summary);
     }
     super::print_line(format_args!("{}", describe(&summary, &args.out)))
+}
+
+/// Width of the hidden layers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Width {
+    /// Given.
+    Values(usize),
+    /// So many times the number of window steps.
+    Windows(usize),
+}
+
+fn parse_width(text: &str) -> Result<Width, String> {
+    let parsed = match text.strip_suffix('w') {
+        Some(times) => times.parse().map(Width::Windows),
+        None => text.parse().map(Width::Values),
+    };
+    parsed.map_err(|_| "allowed are a number of values, such as 200, or of windows, such as 2w".to_owned())
 }
 
 fn parse_windows(text: &str) -> Result<WindowCut, String> {

@@ -22,7 +22,7 @@ pub struct Args {
     /// Directory for caches (default: a folder of the user's cache directory)
     #[arg(long)]
     pub cache: Option<PathBuf>,
-    /// Threads that simulate
+    /// Threads that simulate or train
     #[arg(long, default_value_t = 1)]
     pub threads: usize,
     /// Finish the shard in hand and stop after this many seconds
@@ -127,6 +127,11 @@ async fn work(args: Args) -> anyhow::Result<()> {
             }
         }
         Role::Train => {
+            // Sums do not depend on how many there are.
+            rayon::ThreadPoolBuilder::new()
+                .num_threads(args.threads.max(1))
+                .build_global()
+                .context("cannot start the training threads")?;
             let config = TrainerConfig {
                 database: args.database,
                 store: args.store,

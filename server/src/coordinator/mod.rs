@@ -12,6 +12,7 @@ pub mod supervise;
 pub mod watch;
 
 use crate::http::error::ApiError;
+use crate::sweeps::Sweep;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::orphans::Orphans;
 use hydroflex_ledger::{JobRecord, Ledger, LedgerError, NewJob, ShardKind};
@@ -20,6 +21,7 @@ use hydroflex_openapi::id::{DatasetId, JobId};
 use hydroflex_openapi::job::{JobSpec, TrainingSpec};
 use hydroflex_openapi::problem::FieldError;
 use hydroflex_openapi::status::JobState;
+use hydroflex_openapi::sweep::SweepRequest;
 use machines::{CheckedMachine, MachineDesk};
 use plan::{Situation, shard_sizes};
 use std::collections::HashSet;
@@ -198,6 +200,59 @@ impl Coordinator {
             });
             ApiError::Invalid(moved.collect())
         })
+    }
+
+    /// Checks a sweep against its data set: every entry of every list by the rules of a job's `train`.
+    ///
+    /// # Errors
+    /// The fields at fault.
+    pub async fn accept_sweep(&self, asked: &SweepRequest) -> Result<Sweep, ApiError> {
+        let Some(record) = self.ledger().dataset(&asked.dataset_id).await? else {
+            let error = FieldError::new("/dataset_id", "no such data set")
+                .value(asked.dataset_id.as_str())
+                .allowed("a dataset_id of GET /v1/datasets");
+            return Err(ApiError::field(error));
+        };
+        let machine = self.machine(&record.spec).await.map_err(ApiError::field)?;
+        let mut channels = machine.ready().simulator.channels().to_vec();
+        channels.retain(|channel| record.spec.keeps(&channel.name));
+        let sweep = Sweep::new(asked, &channels).map_err(ApiError::Invalid)?;
+        let (places, train): (Vec<_>, Vec<_>) = sweep.probes().into_iter().unzip();
+        let job = JobSpec { train, ..record.spec };
+        let errors = match machine.validate(&job) {
+            Ok(()) => return Ok(sweep),
+            Err(errors) => errors,
+        };
+        let mut told = HashSet::new();
+        let of_request = errors.into_iter().map(|mut error| {
+            let place = error.pointer.strip_prefix("/train/").and_then(|rest| {
+                let at = rest.find('/')?;
+                Some((*places.get(rest[..at].parse::<usize>().ok()?)?, &rest[at..]))
+            });
+            error.pointer = match place {
+                Some((place, rest)) => sweep.pointer(place, rest),
+                // What the data set's job lacks for it.
+                None => format!("/dataset_id{}", error.pointer),
+            };
+            error
+        });
+        let errors = of_request.filter(|error| told.insert(error.pointer.clone()));
+        Err(ApiError::Invalid(errors.collect()))
+    }
+
+    /// Refuses one more sweep where there are as many as jobs may be.
+    ///
+    /// # Errors
+    /// Says how many there are.
+    pub async fn refuse_sweep_if_full(&self) -> Result<(), ApiError> {
+        let unfinished = self.ledger().unfinished_sweeps().await?;
+        let most = self.config().most_jobs;
+        if unfinished < most {
+            return Ok(());
+        }
+        Err(ApiError::TooManyRequests(format!(
+            "{unfinished} sweeps are unfinished, at most {most} are looked after; try again when some are done"
+        )))
     }
 
     /// Looks after every job until told to stop.

@@ -1,4 +1,4 @@
-//! Local processes: workers and one trainer, started, restarted, stopped, never left behind.
+//! Local processes: workers and trainers, started, restarted, stopped, never left behind.
 //!
 //! One thread of its own starts them all: the kernel ties a child to the *thread* that started it, and
 //! threads of an async runtime come and go.
@@ -39,7 +39,9 @@ pub struct SuperviseConfig {
     pub cache: PathBuf,
     /// Worker processes.
     pub workers: usize,
-    /// Threads of the trainer.
+    /// Trainer processes: trainings that go on at once.
+    pub trainers: usize,
+    /// Threads of each of them.
     pub trainer_threads: usize,
     /// File for what children say; ours if absent.
     pub log: Option<PathBuf>,
@@ -120,7 +122,7 @@ fn supervise(config: &SuperviseConfig, stop: &AtomicBool, restarts: &AtomicU64) 
         stopped_since: None,
     };
     let mut slots: Vec<Slot> = (0..config.workers).map(|_| slot("simulate")).collect();
-    slots.push(slot("train"));
+    slots.extend((0..config.trainers).map(|_| slot("train")));
     let mut started = 0_u64;
     let initial = slots.len() as u64;
     while !stop.load(Ordering::Relaxed) {

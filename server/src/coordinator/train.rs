@@ -10,13 +10,16 @@ use hydroflex_dataset::Dataset;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
 use hydroflex_ledger::{Ledger, NewModel, TrainingClaim, identity};
+use hydroflex_ml::evaluate::{evaluate, with_noise_of_training};
 use hydroflex_ml::model::Model;
 use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{self, TrainError};
 use hydroflex_openapi::catalogue::FileEntry;
-use hydroflex_openapi::dataset::DatasetSource;
+use hydroflex_openapi::dataset::{DatasetSource, SplitName};
 use hydroflex_openapi::id::ModelId;
+use hydroflex_openapi::model::ModelSummary;
 use hydroflex_openapi::status::TrainingProgress;
+use hydroflex_openapi::sweep::CellResult;
 use hydroflex_worker::machines::Machines;
 use sha2::{Digest, Sha256};
 use std::ops::ControlFlow;
@@ -149,8 +152,8 @@ async fn attempt(
             }
         }
     };
-    match learned.context("the training panicked")? {
-        Ok(()) => {}
+    let judged = match learned.context("the training panicked")? {
+        Ok(judged) => judged,
         Err(TrainError::Cancelled { .. }) => {
             // Told to stop: the checkpoint is kept and the attempt given back. If the training was
             // cancelled, it is no longer ours and this changes nothing.
@@ -164,8 +167,8 @@ async fn attempt(
             ledger.fail_training(claim, &error.to_string()).await?;
             return Ok(());
         }
-    }
-    register(ledger, blobs, claim, &folder.join("model")).await?;
+    };
+    register(ledger, blobs, claim, &folder.join("model"), judged).await?;
     let _ = std::fs::remove_dir_all(&folder);
     Ok(())
 }
@@ -178,7 +181,7 @@ fn learn(
     folder: &Path,
     latest: &std::sync::Mutex<Option<TrainingProgress>>,
     cancel: &AtomicBool,
-) -> Result<(), TrainError> {
+) -> Result<Option<CellResult>, TrainError> {
     let dataset = Dataset::open(dataset)?;
     let long = calibration_runs(&dataset, machines, blobs);
     let mut report = |progress: train::Progress| {
@@ -197,15 +200,41 @@ fn learn(
             ControlFlow::Continue(())
         }
     };
-    train::train_dataset(
+    let summary = train::train_dataset(
         &dataset,
         spec,
         long.as_ref(),
         &mut report,
         &folder.join("checkpoint"),
         &folder.join("model"),
-    )
-    .map(drop)
+    )?;
+    match judge(&dataset, &folder.join("model"), &summary) {
+        Ok(judged) => Ok(Some(judged)),
+        Err(error) => {
+            let reason = format!("{error:#}");
+            tracing::warn!(reason, "the model cannot be judged on its data set");
+            Ok(None)
+        }
+    }
+}
+
+/// The model and simple estimators on the data set's test runs, or its validation runs where there are none.
+fn judge(dataset: &Dataset, folder: &Path, summary: &ModelSummary) -> anyhow::Result<CellResult> {
+    let model = Model::load(folder).context("the model that was just written cannot be read")?;
+    let runs = hydroflex_ml::dataset::evaluation_runs(dataset, &model)?;
+    let runs = with_noise_of_training(&model, &runs, model.config().provenance.spec.seed)?;
+    let report = evaluate(&model, &runs, dataset.dataset_sha256())?.report;
+    let has_tests = dataset.runs().iter().any(|run| run.split == SplitName::Test);
+    Ok(CellResult {
+        window_steps: summary.window_steps as u64,
+        window_s: summary.window_s,
+        parameters: summary.parameters as u64,
+        epochs: summary.epochs as u64,
+        judged_on: if has_tests { "test" } else { "validation" }.to_owned(),
+        runs: report.runs as u64,
+        targets: report.targets,
+        baselines: report.baselines,
+    })
 }
 
 /// Long runs of the data set's job; none if they cannot be made, which the model's provenance shows.
@@ -236,6 +265,7 @@ async fn register(
     blobs: &Blobs,
     claim: &TrainingClaim,
     folder: &Path,
+    judged: Option<CellResult>,
 ) -> anyhow::Result<()> {
     let model = Model::load(folder).context("the model that was just written cannot be read")?;
     let id = ModelId::of_sha256(model.sha256())?;
@@ -259,6 +289,7 @@ async fn register(
     let metrics = serde_json::json!({
         "validation": model.config().validation,
         "validation_least_squares": model.config().validation_least_squares,
+        "judged": judged,
     });
     let new = NewModel {
         id,

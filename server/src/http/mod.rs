@@ -17,6 +17,7 @@ pub mod datasets;
 pub mod files;
 pub mod archive;
 pub mod trainings;
+pub mod sweeps;
 pub mod models;
 pub mod predict;
 pub mod aliases;
@@ -146,6 +147,7 @@ impl AppState {
         (name = "jobs", description = "Batches of random runs, and the networks trained on them"),
         (name = "data sets", description = "Published trajectories, immutable, addressed by content"),
         (name = "trainings", description = "Networks for published data sets"),
+        (name = "sweeps", description = "Structures × sensors × windows × seeds on a published data set, as one request"),
         (name = "models", description = "Trained networks and their estimates"),
         (name = "inference", description = "The same estimates by the Open Inference Protocol, version 2"),
         (name = "machines", description = "What can be simulated"),
@@ -166,6 +168,14 @@ fn routes() -> OpenApiRouter<AppState> {
         .routes(routes!(datasets::archive))
         .routes(routes!(trainings::submit))
         .routes(routes!(trainings::show))
+        .routes(routes!(sweeps::submit, sweeps::list))
+        .routes(routes!(sweeps::show))
+        .routes(routes!(sweeps::cancel))
+        .routes(routes!(sweeps::retry))
+        .routes(routes!(sweeps::table))
+        .routes(routes!(sweeps::table_csv))
+        .routes(routes!(sweeps::table_markdown))
+        .routes(routes!(sweeps::plot))
         .routes(routes!(models::list))
         .routes(routes!(models::show))
         .merge(prediction_routes())

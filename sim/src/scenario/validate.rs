@@ -367,6 +367,16 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
             );
         }
     }
+    for (k, name) in training.follow.iter().enumerate() {
+        let pointer = format!("{}/{k}", at("follow"));
+        known_once(&training.follow, k, &pointer, channels, errors);
+        errors.require(
+            structure == "best" && (training.inputs.is_empty() || training.inputs.contains(name)),
+            &pointer,
+            name,
+            "one of the inputs, for structure best",
+        );
+    }
     window(spec, training, &at("window"), errors);
     let positive = |x: Option<f64>| x.is_none_or(|x| x > 0.0 && x.is_finite());
     errors.require(
@@ -374,6 +384,30 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
         at("width"),
         training.width,
         "1 to 4096",
+    );
+    errors.require(
+        training
+            .width_windows
+            .is_none_or(|times| training.width.is_none() && (1..=16).contains(&times)),
+        at("width_windows"),
+        training.width_windows,
+        "1 to 16, without width",
+    );
+    errors.require(
+        training
+            .output_steps
+            .is_none_or(|steps| (1..=1000).contains(&steps) && (steps == 1 || structure != "best")),
+        at("output_steps"),
+        training.output_steps,
+        "1 to 1000; above 1 for structures of letters",
+    );
+    errors.require(
+        training
+            .dropout
+            .is_none_or(|part| (0.0..1.0).contains(&part) && structure.contains('D')),
+        at("dropout"),
+        training.dropout,
+        "at least 0, below 1, for structures with the letter D",
     );
     errors.require(
         training.epochs.is_none_or(|epochs| epochs >= 1),

@@ -36,6 +36,47 @@ pub struct Step {
     halves: Vec<Scratch>,
 }
 
+/// Values that are left out of a step, by chance: a function of the seed, the window, the layer and the value, of nothing
+/// else. Those that stay are larger by as much, so that the sum is the same in the mean.
+#[derive(Debug, Clone, Copy)]
+struct Mask {
+    seed: u64,
+    /// Part left out.
+    rate: f64,
+}
+
+impl Mask {
+    /// Multiplies a row of values (or of derivatives) of the window that begins at `window` by 0 or 1 / (1 − rate).
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the rate is in [0, 1)"
+    )]
+    fn apply(self, layer: usize, window: usize, row: &mut [f32]) {
+        let dropped = (self.rate * 2f64.powi(32)) as u64;
+        let kept = (1.0 / (1.0 - self.rate)) as f32;
+        let mut state =
+            mixed(self.seed ^ mixed(window as u64) ^ mixed((layer as u64).wrapping_add(0x5851_f42d)));
+        for value in row {
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            *value *= if mixed(state) >> 32 < dropped { 0.0 } else { kept };
+        }
+    }
+}
+
+/// `SplitMix64`'s output function.
+fn mixed(state: u64) -> u64 {
+    let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+/// Seed of the values left out of step `batch` of epoch `epoch`.
+#[must_use]
+pub fn dropout_seed(seed: u64, epoch: usize, batch: usize) -> u64 {
+    mixed(mixed(mixed(seed).wrapping_add(epoch as u64)).wrapping_add(batch as u64))
+}
+
 /// What a window is before the first layer.
 enum First {
     /// The window as it is.
@@ -61,6 +102,8 @@ struct Network {
 /// A layer with the current weights, turned as the products want them.
 struct Layer {
     shape: DenseLayer,
+    /// Whether values are left out after it in training.
+    dropout: bool,
     /// A row per input: for the way forward. In a folded first layer, per window value.
     forward: Rows,
     /// A row per output: for the way back; empty in the first layer.
@@ -86,6 +129,8 @@ struct Scratch {
     delta: [Rows; 2],
     /// Per layer, laid out as its weights and bias.
     gradients: Vec<(Rows, Rows)>,
+    /// What is left out at present; nothing when a loss is judged.
+    mask: Option<Mask>,
     loss: f64,
 }
 
@@ -138,6 +183,23 @@ impl Step {
         }
     }
 
+    /// The same with dropout after the layers where `dropouts` says so.
+    #[must_use]
+    pub fn with_dropout(mut self, dropouts: &[bool]) -> Self {
+        for (layer, &dropout) in self.network.layers.iter_mut().zip(dropouts) {
+            layer.dropout = dropout;
+        }
+        self.halves = (0..BATCH_PARTS).map(|_| Scratch::new(&self.network)).collect();
+        self
+    }
+
+    /// From now on gradients leave out the part `rate` of the values after layers with dropout, chosen by `seed`.
+    pub fn leave_out(&mut self, rate: f64, seed: u64) {
+        for half in &mut self.halves {
+            half.mask = Some(Mask { seed, rate });
+        }
+    }
+
     /// Mean loss of the windows `batch` of `samples`, and its gradient (flat, as the parameters).
     ///
     /// # Panics
@@ -151,7 +213,7 @@ impl Step {
     ) -> f64 {
         self.network.take(parameters);
         let (network, loss) = (&self.network, self.loss);
-        let divisor = (batch.len() * samples.part.targets.width) as f32;
+        let divisor = (batch.len() * network.outputs()) as f32;
         let (head, tail) = self.halves.split_at_mut(1);
         let (a, b) = (&mut head[0], &mut tail[0]);
         if batch.len() < SMALLEST_CUT {
@@ -180,7 +242,7 @@ impl Step {
             || a.loss = a.loss_of(network, samples.part, first, loss),
             || b.loss = b.loss_of(network, samples.part, second, loss),
         );
-        (a.loss + b.loss) / (windows.len() * samples.part.targets.width) as f64
+        (a.loss + b.loss) / (windows.len() * network.outputs()) as f64
     }
 }
 
@@ -230,6 +292,7 @@ impl Network {
                     unfolded: Rows::new(if folded { shape.inputs } else { 0 }, shape.outputs),
                     places: Rows::new(BLOCK, shape.outputs).places(),
                     shape: shape.clone(),
+                    dropout: false,
                 }
             })
             .collect();
@@ -239,6 +302,11 @@ impl Network {
             first,
             layers,
         }
+    }
+
+    /// Values that it gives: the targets of one sample, or of several.
+    fn outputs(&self) -> usize {
+        self.layers.last().map_or(0, |layer| layer.shape.outputs)
     }
 
     /// Turns the parameters.
@@ -387,7 +455,8 @@ impl Scratch {
                 .map(|layer| {
                     let kept = layer.shape.activations.iter().enumerate();
                     let beside = kept.filter(|&(position, &a)| is_beside(position, a)).count();
-                    vec![Rows::new(BLOCK, layer.shape.outputs); 1 + beside]
+                    let stages = 1 + beside + usize::from(layer.dropout);
+                    vec![Rows::new(BLOCK, layer.shape.outputs); stages]
                 })
                 .collect(),
             delta: [Rows::new(BLOCK, widest), Rows::new(BLOCK, widest)],
@@ -396,6 +465,7 @@ impl Scratch {
                 .iter()
                 .map(|layer| (layer.forward.clone(), layer.bias.clone()))
                 .collect(),
+            mask: None,
             loss: 0.0,
         }
     }
@@ -409,7 +479,7 @@ impl Scratch {
         }
         let rows = |window: &u32| samples.first_rows[*window as usize];
         for block in batch.chunks(BLOCK) {
-            self.forward(network, samples.part, block.iter().map(rows));
+            self.forward(network, samples.part, block.iter().map(rows), self.mask);
             self.loss += self.errors(network, samples.part, block.iter().map(rows), loss, divisor);
             self.backward(network, &samples.part.series.values);
         }
@@ -419,14 +489,20 @@ impl Scratch {
     fn loss_of(&mut self, network: &Network, part: &Part, first_rows: &[u32], loss: Loss) -> f64 {
         let mut sum = 0.0;
         for block in first_rows.chunks(BLOCK) {
-            self.forward(network, part, block.iter().copied());
+            self.forward(network, part, block.iter().copied(), None);
             sum += self.errors(network, part, block.iter().copied(), loss, 1.0);
         }
         sum
     }
 
-    /// Outputs of all layers for the windows that begin at `first_rows`.
-    fn forward(&mut self, network: &Network, part: &Part, first_rows: impl Iterator<Item = u32>) {
+    /// Outputs of all layers for the windows that begin at `first_rows`, without what `mask` leaves out.
+    fn forward(
+        &mut self,
+        network: &Network,
+        part: &Part,
+        first_rows: impl Iterator<Item = u32>,
+        mask: Option<Mask>,
+    ) {
         let series = &part.series;
         self.windows.clear();
         self.windows
@@ -485,6 +561,17 @@ impl Scratch {
                     &mut stages[stage].values_mut()[..count * width],
                 );
             }
+            if layer.dropout {
+                // Beside what it reads: the derivatives of activations need that.
+                let (head, tail) = stages.split_at_mut(stage + 1);
+                let values = &mut tail[0].values_mut()[..count * width];
+                values.copy_from_slice(&head[stage].values()[..count * width]);
+                if let Some(mask) = mask {
+                    for (row, &window) in values.chunks_mut(width).zip(&self.windows) {
+                        mask.apply(position, window, row);
+                    }
+                }
+            }
         }
     }
 
@@ -502,6 +589,8 @@ impl Scratch {
             return 0.0;
         };
         let (targets, width) = (part.targets.width, layer.bias.width());
+        // The last rows of the window, one after the other, as the outputs are.
+        let count = layer.shape.outputs;
         let outputs = stages.last().map_or(&[][..], Rows::values);
         let mut sum = 0.0;
         for ((row, delta), first) in outputs
@@ -509,9 +598,9 @@ impl Scratch {
             .zip(self.delta[0].values_mut().chunks_mut(width))
             .zip(first_rows)
         {
-            let wanted = (first as usize + part.windows.steps - 1) * targets;
+            let end = (first as usize + part.windows.steps) * targets;
             delta.fill(0.0);
-            let wanted = &part.wanted[wanted..wanted + targets];
+            let wanted = &part.wanted[end - count..end];
             for ((slope, output), wanted) in delta.iter_mut().zip(row).zip(wanted) {
                 let error = output - wanted;
                 sum += loss.value(f64::from(error));
@@ -530,6 +619,14 @@ impl Scratch {
             let stages = &self.values[position];
             let values = &mut delta.values_mut()[..count * width];
             let mut stage = stages.len() - 1;
+            if layer.dropout {
+                stage -= 1;
+                if let Some(mask) = self.mask {
+                    for (row, &window) in values.chunks_mut(width).zip(&self.windows) {
+                        mask.apply(position, window, row);
+                    }
+                }
+            }
             for (position, &activation) in layer.shape.activations.iter().enumerate().rev() {
                 let beside = is_beside(position, activation);
                 let saved = &stages[stage - usize::from(elementwise::saves_input(activation))];
@@ -809,6 +906,114 @@ mod tests {
             let slope = (step.loss(samples, &moved(1.0)) - step.loss(samples, &moved(-1.0))) / (2.0 * h);
             assert!((slope / square - 1.0).abs() < 2e-3, "{name}: {slope} {square}");
         }
+    }
+
+    #[test]
+    fn several_steps_are_the_last_rows_of_the_window() {
+        let part = part();
+        let first_rows = first_rows(&part);
+        let samples = Samples {
+            part: &part,
+            first_rows: &first_rows,
+        };
+        let batch: Vec<u32> = (0..300).map(|i| (i * 37) % 576).collect();
+        let layers = Structure::parse("TLT", 20, None)
+            .unwrap()
+            .layers(VALUES, 3 * TARGETS);
+        let parameters = initial_parameters(&layers, 5, 1.0);
+        let mut step = Step::new(&layers, &Whitening::default(), VALUES, batch.len(), Loss::Square);
+        let mut gradient = vec![0.0; parameters.len()];
+        let loss = step.gradient(samples, &parameters, &batch, &mut gradient);
+        // The bias of the last layer: its gradient is the mean error of each output, which autodiff gives for one
+        // sample at a time with the rows of that sample alone.
+        let last = layers.last().unwrap();
+        let (inputs, size) = (last.inputs, last.inputs * last.outputs + last.outputs);
+        let head = parameters.len() - size;
+        let mut sum = 0.0;
+        for s in 0..3 {
+            let mut single = layers.clone();
+            single.last_mut().unwrap().outputs = TARGETS;
+            let rows = |from: usize, width: usize| {
+                let first = head + from + s * TARGETS * width;
+                parameters[first..first + TARGETS * width].to_vec()
+            };
+            let mut own = parameters[..head].to_vec();
+            own.extend(rows(0, inputs));
+            own.extend(rows(inputs * last.outputs, 1));
+            let mut shifted = part.clone();
+            shifted.wanted.rotate_right((2 - s) * TARGETS);
+            let (value, exact) = by_burn(
+                &shifted,
+                &single,
+                &Whitening::default(),
+                &own,
+                &batch,
+                Loss::Square,
+            );
+            sum += f64::from(value) / 3.0;
+            let bias = &gradient[head + inputs * last.outputs + s * TARGETS..][..TARGETS];
+            for (found, wanted) in bias.iter().zip(&exact[exact.len() - TARGETS..]) {
+                assert!((3.0 * found - wanted).abs() < 1e-5, "{found} {wanted}");
+            }
+        }
+        assert!((loss - sum).abs() < 1e-5 * sum, "{loss} {sum}");
+    }
+
+    #[test]
+    fn dropout_s_gradient_is_the_slope_of_its_loss_and_it_is_off_when_judged() {
+        let part = part();
+        let first_rows = first_rows(&part);
+        let samples = Samples {
+            part: &part,
+            first_rows: &first_rows,
+        };
+        let batch: Vec<u32> = (0..576).collect();
+        for name in ["TDLTD", "RDLR", "EDLTSD", "DLD"] {
+            let structure = Structure::parse(name, 20, None).unwrap();
+            let layers = structure.layers(21, TARGETS);
+            let whitening = whitening(21);
+            let parameters = initial_parameters(&layers, 6, 1.0);
+            let new = || Step::new(&layers, &whitening, VALUES, batch.len(), Loss::PseudoHuber);
+            let mut step = new().with_dropout(&structure.dropouts());
+            let mut gradient = vec![0.0; parameters.len()];
+            let whole = step.gradient(samples, &parameters, &batch, &mut gradient);
+            assert!((whole - step.loss(samples, &parameters)).abs() < 1e-9, "{name}");
+            step.leave_out(0.3, 17);
+            let masked = step.gradient(samples, &parameters, &batch, &mut gradient);
+            assert!((masked - whole).abs() > 1e-4, "{name}: nothing was left out");
+            assert!((whole - step.loss(samples, &parameters)).abs() < 1e-9, "{name}");
+            let square: f64 = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
+            let h = 1e-3 / square.sqrt();
+            let mut unused = vec![0.0; parameters.len()];
+            let mut moved = |sign: f64| {
+                let pairs = parameters.iter().zip(&gradient);
+                let there: Vec<f32> = pairs
+                    .map(|(&p, &g)| (f64::from(p) + sign * h * f64::from(g)) as f32)
+                    .collect();
+                step.gradient(samples, &there, &batch, &mut unused)
+            };
+            let slope = (moved(1.0) - moved(-1.0)) / (2.0 * h);
+            // A ReLU's kinks are crossed.
+            let tolerance = if name.contains('R') { 2e-2 } else { 2e-3 };
+            assert!(
+                (slope / square - 1.0).abs() < tolerance,
+                "{name}: {slope} {square}"
+            );
+        }
+    }
+
+    #[test]
+    fn dropout_leaves_out_its_part_and_keeps_the_mean() {
+        let mut row = vec![1.0_f32; 20_000];
+        let mask = Mask { seed: 3, rate: 0.1 };
+        mask.apply(2, 700, &mut row);
+        let dropped = row.iter().filter(|&&v| v < 0.5).count();
+        assert!((1800..2200).contains(&dropped), "{dropped}");
+        let mut again = vec![1.0_f32; 20_000];
+        mask.apply(2, 700, &mut again);
+        assert_eq!(row, again);
+        mask.apply(3, 700, &mut again);
+        assert_ne!(row, again);
     }
 
     #[test]

@@ -7,11 +7,13 @@ use hydroflex_ledger::{AliasCondition, AliasMove, Created, IdempotencyKey, Ledge
 use hydroflex_openapi::id::{AliasName, ModelId};
 use hydroflex_openapi::job::TrainingSpec;
 use hydroflex_openapi::status::{JobState, TrainingProgress, TrainingState};
+use hydroflex_openapi::sweep::{SweepRequest, SweepState};
 
 on_every_engine![
     a_data_set_appears_once_with_its_trainings,
     a_failed_training_fails_its_job_and_keeps_the_data_set,
     failed_trainings_are_done_again_and_nothing_else,
+    a_sweep_is_what_its_trainings_are,
     of_two_who_move_an_alias_one_wins,
     a_key_is_found_by_its_hash_until_it_is_revoked,
 ];
@@ -173,6 +175,82 @@ async fn failed_trainings_are_done_again_and_nothing_else(ledger: Ledger) {
     let job = ledger.job(id).await.unwrap().unwrap();
     assert_eq!(job.state, JobState::Succeeded);
     assert!(!ledger.retry_job(id).await.unwrap());
+}
+
+async fn a_sweep_is_what_its_trainings_are(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    finish_runs(&ledger, id).await;
+    assert!(ledger.publish_dataset(id, &new_dataset(), &[]).await.unwrap());
+    let request: SweepRequest =
+        serde_json::from_value(serde_json::json!({ "dataset_id": new_dataset().id })).unwrap();
+    let cells: Vec<TrainingSpec> = (0..3)
+        .map(|seed| TrainingSpec {
+            seed,
+            ..TrainingSpec::default()
+        })
+        .collect();
+    let key = IdempotencyKey::new("sweep", b"x");
+    let sweep = ledger.create_sweep(&request, &cells, Some(&key)).await.unwrap();
+    assert_eq!(
+        ledger.create_sweep(&request, &cells, Some(&key)).await.unwrap(),
+        Created::Before(sweep.id())
+    );
+    let id = sweep.id();
+    let single = ledger
+        .create_training(&request.dataset_id, &TrainingSpec::default(), None)
+        .await
+        .unwrap();
+    // What was asked for by itself does not wait for a sweep, although it came later.
+    let claim = ledger.begin_training("a").await.unwrap().unwrap();
+    assert_eq!(claim.training.id, single.id());
+    let first = ledger.begin_training("a").await.unwrap().unwrap();
+    let model = NewModel {
+        id: ModelId::of_sha256(HASH).unwrap(),
+        sha256: HASH.to_owned(),
+        metrics: serde_json::json!({ "judged": 1 }),
+        files: Vec::new(),
+    };
+    assert!(ledger.commit_training(&first, &model).await.unwrap());
+    let second = ledger.begin_training("a").await.unwrap().unwrap();
+    ledger.fail_training(&second, "no").await.unwrap();
+    let (progress, _) = ledger.sweep_progress(id).await.unwrap();
+    assert_eq!(
+        (progress.total, progress.open, progress.succeeded, progress.failed),
+        (3, 1, 1, 1)
+    );
+    assert_eq!(progress.state(), SweepState::Running);
+    let third = ledger.begin_training("a").await.unwrap().unwrap();
+    assert_eq!(ledger.cancel_sweep(id).await.unwrap(), 1);
+    assert!(!ledger.holds_training(&third).await.unwrap());
+    assert!(!ledger.commit_training(&third, &model).await.unwrap());
+    let (progress, finished_ms) = ledger.sweep_progress(id).await.unwrap();
+    assert_eq!(progress.state(), SweepState::Cancelled);
+    assert!(finished_ms.is_some());
+    // What is there is not trained again.
+    assert_eq!(ledger.retry_sweep(id).await.unwrap(), 2);
+    for expected in [&second, &third] {
+        let again = ledger.begin_training("a").await.unwrap().unwrap();
+        assert_eq!(
+            (again.training.id, again.training.attempt),
+            (expected.training.id, 1)
+        );
+        assert!(ledger.commit_training(&again, &model).await.unwrap());
+    }
+    assert_eq!(
+        ledger.sweep_progress(id).await.unwrap().0.state(),
+        SweepState::Succeeded
+    );
+    let seeds: Vec<(u64, bool)> = ledger
+        .sweep_cells(id)
+        .await
+        .unwrap()
+        .iter()
+        .map(|cell| (cell.training.spec.seed, cell.metrics.is_some()))
+        .collect();
+    assert_eq!(seeds, [(0, true), (1, true), (2, true)]);
+    assert_eq!(ledger.sweeps(None, 10).await.unwrap().len(), 1);
+    assert!(ledger.sweeps(Some(id), 10).await.unwrap().is_empty());
+    assert_eq!(ledger.unfinished_sweeps().await.unwrap(), 0);
 }
 
 async fn of_two_who_move_an_alias_one_wins(ledger: Ledger) {

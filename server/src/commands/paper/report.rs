@@ -1,6 +1,6 @@
 //! `report.md`: tables in physical units, means over the seeds.
 
-use super::{Args, Cell, NoiseChoice, Payload, RANDOM_EVALUATED, Recipe};
+use super::{Args, Cell, NoiseChoice, Payload, Recipe};
 use hydroflex_ml::evaluate::faults::{EFFECT, STRETCH_S};
 use hydroflex_ml::evaluate::table::{PUBLISHED, display_unit, significant};
 use hydroflex_ml::plot::errors::{ErrorKind, ErrorPanel, ErrorPicture, ErrorRow};
@@ -13,12 +13,13 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
         "# The published study, repeated\n\n\
          Machine `{machine}`, integrator `{:?}` at 5 ms, {} training runs of 1 s per payload, all overlapping \
          windows unless trained as published, {} seed{} per cell (means are shown, the range of the seeds in brackets). None of \
-         the evaluation signals was seen: the published 10 s cycle, and the first {RANDOM_EVALUATED} random 10 s runs that stay \
+         the evaluation signals was seen: the published 10 s cycle, and the first {} random 10 s runs that stay \
          within stroke and pressures.\n",
         args.integrator,
         args.runs,
         args.seeds,
         if args.seeds == 1 { "" } else { "s" },
+        args.signals,
     );
     let targets = cells.first().map_or(&[][..], |cell| &cell.cycle.targets);
     for (t, target) in targets.iter().enumerate() {
