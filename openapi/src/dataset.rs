@@ -121,6 +121,9 @@ pub struct Manifest {
     pub runs: RunCounts,
     /// Runs per flag.
     pub flags: BTreeMap<String, u64>,
+    /// Runs per path through the solver: `planar`, `tree`, `general`, `trapezoidal-index-2`, `generalized-alpha`.
+    #[serde(default)]
+    pub solver_paths: BTreeMap<String, u64>,
     /// Every file but this one and `SHA256SUMS`, by path.
     pub files: Vec<ManifestFile>,
 }

@@ -1,7 +1,7 @@
 //! What happens to a job, in order: the events of `GET /v1/jobs/{id}/events`.
 
 use crate::id::{DatasetId, ModelId, TrainingId};
-use crate::status::{JobState, TrainingProgress};
+use crate::status::{JobNotice, JobState, TrainingProgress};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -28,6 +28,11 @@ pub enum EventKind {
         /// Why, where there is a reason.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         reason: Option<String>,
+    },
+    /// The job was accepted with a remark.
+    Notice {
+        /// The remark.
+        notice: JobNotice,
     },
     /// A shard was committed.
     Progress {
@@ -87,6 +92,7 @@ impl EventKind {
     pub fn name(&self) -> &'static str {
         match self {
             Self::State { .. } => "state",
+            Self::Notice { .. } => "notice",
             Self::Progress { .. } => "progress",
             Self::ShardLost { .. } => "shard_lost",
             Self::Dataset { .. } => "dataset",

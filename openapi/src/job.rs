@@ -2,6 +2,7 @@
 //!
 //! Units are in the names. Absent keys take the defaults documented here; unknown keys are refused.
 
+use crate::machine::MaterialSpec;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use utoipa::ToSchema;
@@ -36,6 +37,10 @@ pub struct JobSpec {
     /// Payload: a value, or a range from which each run draws uniformly.
     #[serde(default = "default_payload")]
     pub payload_kg: ValueOrRange,
+    /// Materials to vary: each run draws one, of which all its flexible bodies are, and `meta/runs.parquet` names it. Absent: those of
+    /// the machine file. At most 16.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub materials: Vec<MaterialRef>,
     /// Ranges of the initial angles by name (`{"lift": [-10, 50]}`); default: the machine's.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub initial_angle_deg: BTreeMap<String, [f64; 2]>,
@@ -140,6 +145,36 @@ pub enum MachineRef {
         /// TOML text.
         toml: String,
     },
+}
+
+/// Which material.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum MaterialRef {
+    /// `steel`, `aluminium` or `titanium`.
+    Named(String),
+    /// Any isotropic one.
+    Given(MaterialSpec),
+}
+
+impl MaterialRef {
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Named(name) => name,
+            Self::Given(material) => &material.name,
+        }
+    }
+
+    /// The material; absent if nothing is known by the name.
+    #[must_use]
+    pub fn material(&self) -> Option<MaterialSpec> {
+        match self {
+            Self::Named(name) => MaterialSpec::named(name),
+            Self::Given(material) => Some(material.clone()),
+        }
+    }
 }
 
 /// A number, or a range `{"min": a, "max": b}`.
@@ -283,6 +318,55 @@ pub enum RunStatus {
     Ok,
     /// No samples: the solver did not converge or a number was not finite.
     Failed,
+}
+
+/// Which equations a run solved, and how. Chosen from the integrator asked for and what the machine is.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "kebab-case")]
+pub enum SolverPath {
+    /// `accurate`, minimal coordinates of one boom that moves in its plane; runs go side by side.
+    Planar,
+    /// `accurate`, free coordinates of a planar tree of bodies with closed loops.
+    Tree,
+    /// `accurate`, redundant coordinates with constraints: any machine.
+    #[default]
+    General,
+    /// The published scripts' scheme in redundant coordinates, fixed steps.
+    #[serde(rename = "trapezoidal-index-2")]
+    TrapezoidalIndex2,
+    /// Generalised-α in redundant coordinates, fixed steps.
+    GeneralizedAlpha,
+}
+
+impl SolverPath {
+    /// Every path.
+    pub const ALL: [Self; 5] = [
+        Self::Planar,
+        Self::Tree,
+        Self::General,
+        Self::TrapezoidalIndex2,
+        Self::GeneralizedAlpha,
+    ];
+
+    /// Name in JSON and in data sets.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Planar => "planar",
+            Self::Tree => "tree",
+            Self::General => "general",
+            Self::TrapezoidalIndex2 => "trapezoidal-index-2",
+            Self::GeneralizedAlpha => "generalized-alpha",
+        }
+    }
+
+    /// The path of that name.
+    #[must_use]
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|path| path.as_str() == name)
+    }
 }
 
 /// Type of samples in published files.

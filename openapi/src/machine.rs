@@ -4,6 +4,7 @@
 //! (checked whole against meshes and physics).
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// Version of the machine file format this build reads.
 pub const MACHINE_FORMAT: u32 = 1;
@@ -163,7 +164,7 @@ pub enum MeshSource {
 }
 
 /// Isotropic material.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MaterialSpec {
     /// Name for reports.
@@ -174,6 +175,29 @@ pub struct MaterialSpec {
     pub poisson_ratio: f64,
     /// Density.
     pub density_kg_per_m3: f64,
+}
+
+impl MaterialSpec {
+    /// Names of the materials that [`MaterialSpec::named`] knows.
+    pub const NAMES: [&'static str; 3] = ["steel", "aluminium", "titanium"];
+
+    /// A material by name: structural steel (EN 1993-1-1, 3.2.6; density EN 1991-1-1, table A.4), wrought aluminium alloys
+    /// (EN 1999-1-1, 3.2.5), titanium Ti-6Al-4V, annealed (ASM Aerospace Specification Metals, MTP641).
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        let (youngs_modulus_pa, poisson_ratio, density_kg_per_m3) = match name {
+            "steel" => (2.1e11, 0.3, 7850.0),
+            "aluminium" => (7.0e10, 0.3, 2700.0),
+            "titanium" => (1.138e11, 0.342, 4430.0),
+            _ => return None,
+        };
+        Some(Self {
+            name: name.to_owned(),
+            youngs_modulus_pa,
+            poisson_ratio,
+            density_kg_per_m3,
+        })
+    }
 }
 
 /// Kind of mass matrix.

@@ -96,6 +96,9 @@ pub struct JobStatus {
     /// another level leave the job alone, because their numbers would differ in the last digits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub instruction_set: Option<String>,
+    /// What the service has to say about the job as it was asked for: nothing is wrong, but something may not be meant.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub notices: Vec<JobNotice>,
     /// Runs.
     pub progress: Progress,
     /// The data set, once published.
@@ -118,6 +121,18 @@ pub struct JobStatus {
     /// When it ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub finished_at: Option<String>,
+}
+
+/// A remark on a job that was accepted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct JobNotice {
+    /// JSON pointer (RFC 6901) into the job: `/duration_s`.
+    pub pointer: String,
+    /// What is remarkable.
+    pub detail: String,
+    /// A value that would not be.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub proposed: Option<serde_json::Value>,
 }
 
 /// Runs of a job, counted.

@@ -33,6 +33,10 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client};
 use tokio_util::sync::CancellationToken;
 
+/// As in the service.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
@@ -250,6 +254,7 @@ struct Seen {
 impl Seen {
     fn add(&mut self, other: Self) {
         self.latencies_us.extend(other.latencies_us);
+        self.late_us.extend(other.late_us);
         self.last = self.last.max(other.last);
         for (status, count) in other.statuses {
             *self.statuses.entry(status).or_default() += count;
@@ -373,111 +378,59 @@ fn whole_answer(buffer: &[u8]) -> anyhow::Result<Option<u16>> {
     Ok((buffer.len() >= head + 4 + length).then_some(status))
 }
 
-/// Something that is sent and answered on a connection that does not block.
-trait Exchange {
-    fn send(&mut self) -> anyhow::Result<()>;
-    /// The answer's status, once it is there.
-    fn poll(&mut self) -> anyhow::Result<Option<u16>>;
-}
-
-/// When latencies begin.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Counted {
-    FromDue,
-    FromSent,
-}
-
-/// Exchanges on a schedule, evenly spread, from one thread that never sleeps: timers tick, all that
-/// is due at a tick would be sent at once, and waking up takes longer than most answers.
-fn on_schedule<E: Exchange>(
-    exchanges: Vec<E>,
-    period: Duration,
-    seconds: f64,
-    counted: Counted,
-) -> anyhow::Result<Seen> {
-    let begun = Instant::now() + Duration::from_millis(10);
-    let end = begun + Duration::from_secs_f64(seconds);
-    let count = exchanges.len() as f64;
-    // Each with when it is due next, and from when an open one counts.
-    let mut turns: Vec<(E, Instant, Option<Instant>)> = exchanges
-        .into_iter()
-        .enumerate()
-        .map(|(number, exchange)| (exchange, begun + period.mul_f64(number as f64 / count), None))
-        .collect();
-    let mut seen = Seen::default();
-    loop {
-        let mut is_open = false;
-        for (exchange, due, open) in &mut turns {
-            if let Some(since) = *open {
-                is_open = true;
-                if let Some(status) = exchange.poll()? {
-                    *seen.statuses.entry(status).or_default() += 1;
-                    seen.latencies_us.push(since.elapsed().as_secs_f32() * 1e6);
-                    *open = None;
-                }
-            } else if *due < end {
-                is_open = true;
-                let now = Instant::now();
-                if now >= *due {
-                    seen.late_us.push((now - *due).as_secs_f32() * 1e6);
-                    *open = Some(if counted == Counted::FromDue { *due } else { now });
-                    *due += period;
-                    exchange.send()?;
-                }
-            }
-        }
-        if !is_open {
-            return Ok(seen);
-        }
-    }
-}
-
-struct Http<'r> {
-    socket: std::net::TcpStream,
-    request: &'r [u8],
-    buffer: Vec<u8>,
-}
-
-impl Exchange for Http<'_> {
-    fn send(&mut self) -> anyhow::Result<()> {
-        self.buffer.clear();
-        Ok(self.socket.write_all(self.request)?)
-    }
-
-    fn poll(&mut self) -> anyhow::Result<Option<u16>> {
-        let mut piece = [0; 4096];
-        match self.socket.read(&mut piece) {
-            Ok(0) => bail!("the server closed the connection"),
-            Ok(count) => {
-                self.buffer.extend_from_slice(&piece[..count]);
-                whole_answer(&self.buffer)
-            }
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
-            Err(error) => Err(error.into()),
-        }
-    }
-}
-
-/// Requests on a schedule (`rate` per second of all connections); latencies count from when a request
-/// was due.
+/// Requests on a schedule (`rate` per second of all connections), a thread for each connection that sleeps
+/// until the next is due; latencies count from when a request was due.
 fn open_loop(address: &str, connections: u32, seconds: f64, rate: f64, request: &[u8]) -> anyhow::Result<()> {
-    let exchanges = (0..connections)
-        .map(|_| {
-            let socket = std::net::TcpStream::connect(address)?;
-            socket.set_nodelay(true)?;
-            socket.set_nonblocking(true)?;
-            let buffer = Vec::new();
-            Ok(Http {
-                socket,
-                request,
-                buffer,
-            })
-        })
-        .collect::<std::io::Result<Vec<_>>>()?;
     let period = Duration::from_secs_f64(f64::from(connections) / rate);
-    let all = on_schedule(exchanges, period, seconds, Counted::FromDue)?;
+    let begun = Instant::now() + Duration::from_millis(20);
+    let end = begun + Duration::from_secs_f64(seconds);
+    let all = std::thread::scope(|scope| {
+        let connections: Vec<_> = (0..connections)
+            .map(|number| {
+                let first = begun + period.mul_f64(f64::from(number) / f64::from(connections));
+                scope.spawn(move || one_of_open_loop(address, request, first, period, end))
+            })
+            .collect();
+        let mut all = Seen::default();
+        for connection in connections {
+            all.add(connection.join().expect("a connection's thread")?);
+        }
+        anyhow::Ok(all)
+    })?;
     println!("{}", report(all, seconds));
     Ok(())
+}
+
+fn one_of_open_loop(
+    address: &str,
+    request: &[u8],
+    mut due: Instant,
+    period: Duration,
+    end: Instant,
+) -> anyhow::Result<Seen> {
+    // The kernel may put off a wake-up by 50 µs, to save power, unless it is told not to.
+    nix::sys::prctl::set_timerslack(1)?;
+    let mut socket = std::net::TcpStream::connect(address)?;
+    socket.set_nodelay(true)?;
+    let (mut seen, mut buffer) = (Seen::default(), Vec::new());
+    while due < end {
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        seen.late_us.push(due.elapsed().as_secs_f32() * 1e6);
+        socket.write_all(request)?;
+        buffer.clear();
+        let status = loop {
+            let mut piece = [0; 4096];
+            let count = socket.read(&mut piece)?;
+            ensure!(count > 0, "the server closed the connection");
+            buffer.extend_from_slice(&piece[..count]);
+            if let Some(status) = whole_answer(&buffer)? {
+                break status;
+            }
+        };
+        seen.note(status, due);
+        due += period;
+    }
+    Ok(seen)
 }
 
 struct Live<'s> {
@@ -487,7 +440,7 @@ struct Live<'s> {
     step: u64,
 }
 
-impl Exchange for Live<'_> {
+impl Live<'_> {
     fn send(&mut self) -> anyhow::Result<()> {
         let mut frame = self.step.to_le_bytes().to_vec();
         let row = usize::try_from(self.step % 512)? * self.width;
@@ -496,6 +449,7 @@ impl Exchange for Live<'_> {
         Ok(self.socket.send(Message::binary(frame))?)
     }
 
+    /// The answer's status, once it is there.
     fn poll(&mut self) -> anyhow::Result<Option<u16>> {
         let answer = match self.socket.read() {
             Ok(answer) => answer.into_data(),
@@ -511,11 +465,12 @@ impl Exchange for Live<'_> {
     }
 }
 
-/// Live sessions, each with its own schedule; round trips count from when a sample was sent.
+/// Live sessions, each with its own schedule, evenly spread, from one thread that never sleeps: with so many,
+/// timers would send all that is due at a tick at once. Round trips count from when a sample was sent.
 fn stream(address: &str, model: &str, sessions: u32, rate: f64, seconds: f64) -> anyhow::Result<()> {
     let url = format!("ws://{address}/v1/models/{model}/stream");
     let samples = signal(0, 512);
-    let mut exchanges = Vec::new();
+    let mut live = Vec::new();
     for _ in 0..sessions {
         let socket = std::net::TcpStream::connect(address)?;
         socket.set_nodelay(true)?;
@@ -523,19 +478,49 @@ fn stream(address: &str, model: &str, sessions: u32, rate: f64, seconds: f64) ->
         let opened = socket.read()?;
         let opened: StreamOpened = serde_json::from_str(opened.to_text()?)?;
         socket.get_ref().set_nonblocking(true)?;
-        exchanges.push(Live {
+        live.push(Live {
             socket,
             samples: &samples,
             width: opened.inputs.len(),
             step: 0,
         });
     }
-    let all = on_schedule(
-        exchanges,
-        Duration::from_secs_f64(1.0 / rate),
-        seconds,
-        Counted::FromSent,
-    )?;
-    println!("{}", report(all, seconds));
-    Ok(())
+    let period = Duration::from_secs_f64(1.0 / rate);
+    let begun = Instant::now() + Duration::from_millis(10);
+    let end = begun + Duration::from_secs_f64(seconds);
+    // Each with when it is due next, and when an open one was sent.
+    let mut turns: Vec<(Live<'_>, Instant, Option<Instant>)> = live
+        .into_iter()
+        .enumerate()
+        .map(|(number, session)| {
+            let share = number as f64 / f64::from(sessions);
+            (session, begun + period.mul_f64(share), None)
+        })
+        .collect();
+    let mut seen = Seen::default();
+    loop {
+        let mut is_open = false;
+        for (session, due, open) in &mut turns {
+            if let Some(since) = *open {
+                is_open = true;
+                if let Some(status) = session.poll()? {
+                    *seen.statuses.entry(status).or_default() += 1;
+                    seen.latencies_us.push(since.elapsed().as_secs_f32() * 1e6);
+                    *open = None;
+                }
+            } else if *due < end {
+                is_open = true;
+                let now = Instant::now();
+                if now >= *due {
+                    *open = Some(now);
+                    *due += period;
+                    session.send()?;
+                }
+            }
+        }
+        if !is_open {
+            println!("{}", report(seen, seconds));
+            return Ok(());
+        }
+    }
 }

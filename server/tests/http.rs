@@ -43,6 +43,48 @@ async fn a_job_is_accepted_shown_listed_and_cancelled() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_job_of_runs_too_short_for_its_windows_says_so() {
+    let desk = Desk::new().await;
+    let accepted = desk
+        .post("/v1/jobs", r#"{"runs": 8, "payload_kg": 200, "duration_s": 0.5}"#)
+        .await;
+    assert_eq!(accepted.status, 202);
+    let job: JobStatus = accepted.json();
+    assert_eq!(job.notices.len(), 1, "{:?}", job.notices);
+    assert_eq!(job.notices[0].pointer, "/duration_s");
+    let proposed_s = job.notices[0].proposed.as_ref().unwrap().as_f64().unwrap();
+    assert!(proposed_s > 0.9, "{:?}", job.notices);
+    let shown: JobStatus = desk.get(accepted.header("location")).await.json();
+    assert_eq!(shown.notices, job.notices);
+    let events = desk.ledger.events(job.job_id, 0, 10).await.unwrap();
+    assert!(events.iter().any(|event| event.what.name() == "notice"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_varies_materials_and_is_refused_what_is_none() {
+    let desk = Desk::new().await;
+    let accepted = desk
+        .post("/v1/jobs", r#"{"runs": 8, "materials": ["steel", "aluminium"]}"#)
+        .await;
+    assert_eq!(
+        accepted.status,
+        202,
+        "{}",
+        String::from_utf8_lossy(&accepted.body)
+    );
+    let problem = desk
+        .post("/v1/jobs", r#"{"runs": 8, "materials": ["steel", "wood"]}"#)
+        .await
+        .problem(422);
+    let error = &problem.errors[0];
+    assert_eq!(
+        (error.pointer.as_str(), error.value.clone()),
+        ("/materials/1", Some("wood".into()))
+    );
+    assert!(error.allowed.as_ref().unwrap().contains("titanium"), "{error:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_mesh_is_uploaded_once_checked_and_named_by_a_job() {
     let desk = Desk::new().await;
     // The built-in mesh under a machine file that wants one given.
@@ -267,6 +309,7 @@ async fn publish(desk: &Desk) -> (DatasetInfo, Vec<Vec<u8>>) {
         machine_sha256: hash(b""),
         settling_shards: Vec::new(),
         run_shards: vec![1],
+        notices: Vec::new(),
     };
     let job = desk.ledger.create_job(&new, None).await.unwrap().id();
     desk.ledger
@@ -284,6 +327,7 @@ async fn publish(desk: &Desk) -> (DatasetInfo, Vec<Vec<u8>>) {
     desk.ledger.commit_shard(&claim, &result).await.unwrap();
     assert!(desk.ledger.begin_publishing(job).await.unwrap());
     let dataset = NewDataset {
+        round: 0,
         id: id.clone(),
         sha256,
         spec,

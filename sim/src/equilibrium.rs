@@ -159,7 +159,7 @@ pub(crate) fn start_lengths_m(
 /// Angle of a frame about global Z, in (−π, π].
 #[must_use]
 pub fn angle_about_z(rotation: &Matrix3<f64>) -> f64 {
-    rotation[(1, 0)].atan2(rotation[(0, 0)])
+    libm::atan2(rotation[(1, 0)], rotation[(0, 0)])
 }
 
 /// `−A₁ Δp₁ + A₂ Δp₂ = lock`, with Δp₂ = 0 where that is possible.

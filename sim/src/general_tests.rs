@@ -60,11 +60,11 @@ fn equilibrium_balances_moments_about_the_pivot() {
         let cylinder = &bench.system.cylinders()[0];
         let force = cylinder.oil_force_n(p, 0.0);
         // Lever arm of the cylinder and of the weights, all by hand.
-        let (sin, cos) = 0.4_f64.sin_cos();
+        let (sin, cos) = libm::sincos(0.4);
         let turn = |x: f64, y: f64| (cos * x - sin * y, sin * x + cos * y);
         let eye = turn(0.304, -0.083);
         let base = (0.17 + 0.09, 0.386 - 1.4261);
-        let length = (eye.0 - base.0).hypot(eye.1 - base.1);
+        let length = libm::hypot(eye.0 - base.0, eye.1 - base.1);
         let arm = (eye.0 * (eye.1 - base.1) - eye.1 * (eye.0 - base.0)) / length;
         let weights = 9.81 * (120.0 * turn(1.1, 0.05).0 + payload_kg * turn(2.85, 0.015).0);
         assert!(
@@ -109,7 +109,7 @@ fn a_machine_with_its_valve_shut_stays_where_it_is() {
 #[test]
 fn oil_that_came_in_minus_oil_that_went_out_is_stored() {
     let bench = bench(rig(), 50.0, 0.2);
-    let valve: Vec<f64> = (0..400).map(|k| (f64::from(k) * 0.02).sin() * 0.6).collect();
+    let valve: Vec<f64> = (0..400).map(|k| libm::sin(f64::from(k) * 0.02) * 0.6).collect();
     let dt = 5e-4;
     let run = bench.run(valve.clone(), dt, |r| {
         r.fixed(Scheme::generalized_alpha(0.7), 1).unwrap()
@@ -185,7 +185,7 @@ fn an_end_stop_holds_the_piston() {
 fn accurate_runs_agree_with_short_steps() {
     let bench = bench(rig(), 100.0, 0.2);
     let valve: Vec<f64> = (0..60)
-        .map(|k| if k % 17 < 6 { -0.7 } else { (f64::from(k)).sin() })
+        .map(|k| if k % 17 < 6 { -0.7 } else { libm::sin(f64::from(k)) })
         .collect();
     let listed = channels(&bench.file);
     let accurate = bench.run(valve.clone(), 0.005, |r| r.accurate(&listed).unwrap());
@@ -209,7 +209,7 @@ fn accurate_runs_agree_with_short_steps() {
 #[test]
 fn the_same_run_twice_gives_the_same_bits() {
     let bench = bench(rig(), 100.0, 0.2);
-    let valve: Vec<f64> = (0..100).map(|k| (f64::from(k) * 1.7).sin()).collect();
+    let valve: Vec<f64> = (0..100).map(|k| libm::sin(f64::from(k) * 1.7)).collect();
     let once = |_: u8| {
         bench.run(valve.clone(), 0.005, |r| {
             r.fixed(Scheme::TRAPEZOIDAL_INDEX_2, 1).unwrap()

@@ -19,7 +19,7 @@ use hydroflex_openapi::job::{Excitation, JobSpec, ValueOrRange};
 use hydroflex_openapi::machine::{AngleSpec, CylinderSpec, InsteadSpec, MachineFile};
 use stream::Stream;
 
-pub use validate::validate;
+pub use validate::{validate, validate_materials};
 
 /// Part of a settling run during which the valve is open (the paper's text; its script has 10 %).
 pub const SETTLING_OPEN_PART: f64 = 0.2;
@@ -181,6 +181,13 @@ pub fn run_seed(job_seed: u64, run_index: u64) -> u64 {
 #[must_use]
 pub fn settling_run_seed(job_seed: u64, index: u64) -> u64 {
     stream::derive_seed("settling", job_seed, index)
+}
+
+/// Material of the run with this seed, a place in the job's list; none if the job varies none. From a stream of its own: a
+/// job's other random numbers are the same with and without.
+#[must_use]
+pub fn material_index(spec: &JobSpec, seed: u64) -> Option<usize> {
+    (!spec.materials.is_empty()).then(|| Stream::new(seed, "material").below(spec.materials.len()))
 }
 
 fn payload_kg(spec: &JobSpec, seed: u64) -> f64 {

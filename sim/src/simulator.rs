@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 
 use hydroflex_openapi::channel::Channel;
-use hydroflex_openapi::job::Integrator;
+use hydroflex_openapi::job::{Integrator, SolverPath};
 use hydroflex_openapi::machine::MachineFile;
 
 use crate::equilibrium::{Equilibrium, equilibrium, fixed_step_start, start_lengths_m};
@@ -199,6 +199,26 @@ impl Simulator {
         })
     }
 
+    /// Which equations a run with or without payload solves.
+    ///
+    /// # Errors
+    /// As [`Simulator::prepare`].
+    pub fn solver_path(
+        &self,
+        integrator: Integrator,
+        with_payload: bool,
+    ) -> Result<SolverPath, SimulatorError> {
+        Ok(match integrator {
+            Integrator::TrapezoidalIndex2 { .. } => SolverPath::TrapezoidalIndex2,
+            Integrator::GeneralizedAlpha { .. } => SolverPath::GeneralizedAlpha,
+            Integrator::Accurate => match self.accurate_path(with_payload)? {
+                AccuratePath::Planar => SolverPath::Planar,
+                AccuratePath::Tree => SolverPath::Tree,
+                AccuratePath::General { .. } => SolverPath::General,
+            },
+        })
+    }
+
     /// Whether [`Simulator::run_batch`] simulates runs side by side, rather than one after the other.
     #[must_use]
     pub fn runs_side_by_side(&self, settings: &RunSettings, with_payload: bool) -> bool {
@@ -287,7 +307,7 @@ impl Simulator {
             valves_ratio: &input.valves_ratio,
             sample_time_s: settings.sample_time_s,
         };
-        match settings.integrator {
+        let trajectory = match settings.integrator {
             Integrator::TrapezoidalIndex2 { step_s } => {
                 let steps = steps_per_sample(settings.sample_time_s, step_s)?;
                 run.fixed(Scheme::TRAPEZOIDAL_INDEX_2, steps)
@@ -297,7 +317,14 @@ impl Simulator {
                 run.fixed(Scheme::generalized_alpha(SPECTRAL_RADIUS), steps)
             }
             Integrator::Accurate => run.accurate(&self.channels),
-        }
+        };
+        let mut trajectory = trajectory?;
+        trajectory.statistics.path = match settings.integrator {
+            Integrator::TrapezoidalIndex2 { .. } => SolverPath::TrapezoidalIndex2,
+            Integrator::GeneralizedAlpha { .. } => SolverPath::GeneralizedAlpha,
+            Integrator::Accurate => SolverPath::General,
+        };
+        Ok(trajectory)
     }
 }
 

@@ -1,9 +1,9 @@
 //! What there is to know about a machine before it moves: for `hydroflex machine show`.
 
-use crate::fe::{assemble_mass, assemble_stiffness};
+use crate::fe::{InterfaceNodes, assemble_mass, assemble_stiffness};
 use crate::linearise::Actuation;
 use crate::machine::FlexibleBody;
-use crate::reduction::{ReducedBody, ReductionError, clamped_hz, free_free_hz};
+use crate::reduction::{ClampedModel, ReducedBody, ReductionError, free_free_hz};
 use crate::simulator::{Simulator, SimulatorError};
 use hydroflex_openapi::machine::{
     BodySpec, Boundary, CylinderSpec, FlexibleBodySpec, MachineFile, PayloadSpec,
@@ -134,6 +134,23 @@ pub struct BasisSummary {
     /// The same of the full model, as many as the reduction is meant to keep: what it lost. Empty
     /// if the first interface alone does not hold the body.
     pub full_hz: Vec<f64>,
+    /// Static deflections of the other interfaces under loads at them, reduced and full: what the reduction lost.
+    /// Empty where `full_hz` is.
+    pub deflections: Vec<DeflectionSummary>,
+}
+
+/// How far an interface gives way in the direction of a force on it, first interface held. The force is spread over the
+/// interface's nodes by their marker weights, the deflection is their weighted mean.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DeflectionSummary {
+    /// Interface.
+    pub interface: String,
+    /// Per newton along x, y and z of the body frame, full model.
+    pub full_m_per_n: [f64; 3],
+    /// The same of the reduced body: smaller, as a basis can only stiffen.
+    pub reduced_m_per_n: [f64; 3],
+    /// Part of the full deflection that the reduction lost, along x, y and z.
+    pub lost_ratio: [f64; 3],
 }
 
 /// A configuration at rest.
@@ -215,14 +232,14 @@ fn flexible_summary(
     for node in &body.interfaces[0].nodes {
         is_fixed[*node as usize] = true;
     }
-    let full_hz = match clamped_hz(&stiffness, &mass, &is_fixed, FULL_COUNT) {
+    let full = match ClampedModel::new(&stiffness, &mass, &is_fixed) {
         // parts that only their other interfaces hold, as the published tilt boom has
-        Err(ReductionError::SingularStiffness { .. }) => Vec::new(),
-        full_hz => full_hz?,
+        Err(ReductionError::SingularStiffness { .. }) => None,
+        model => Some(full_model(&model?, &body.interfaces)?),
     };
-    let mut bases = vec![basis(without, false, &full_hz)];
+    let mut bases = vec![basis(without, false, full.as_ref())];
     if body.boundary_with_payload != body.boundary_without_payload {
-        bases.push(basis(&simulator.reduced(true)?[index], true, &full_hz));
+        bases.push(basis(&simulator.reduced(true)?[index], true, full.as_ref()));
     }
     // the free body's first bending lies a few times above the clamped one
     let scale_hz = 3.0 * without.report.fixed_interface_hz.first().unwrap_or(&30.0);
@@ -262,14 +279,63 @@ fn flexible_summary(
     })
 }
 
-fn basis(body: &ReducedBody, with_payload: bool, full_hz: &[f64]) -> BasisSummary {
+/// What the full model says with its first interface held.
+struct FullModel {
+    lowest_hz: Vec<f64>,
+    /// Of every interface after the first.
+    compliances_m_per_n: Vec<[f64; 3]>,
+}
+
+fn full_model(model: &ClampedModel<'_>, interfaces: &[InterfaceNodes]) -> Result<FullModel, ReductionError> {
+    let others = &interfaces[1..];
+    let mut loads_n = DMatrix::zeros(model.node_count() * 3, 3 * others.len());
+    for (k, interface) in others.iter().enumerate() {
+        for (node, weight) in interface.nodes.iter().zip(&interface.weights) {
+            for c in 0..3 {
+                loads_n[(3 * *node as usize + c, 3 * k + c)] = *weight;
+            }
+        }
+    }
+    let deflections_m = model.deflections_m(&loads_n);
+    let compliance = |column: usize| loads_n.column(column).dot(&deflections_m.column(column));
+    Ok(FullModel {
+        lowest_hz: model.lowest_hz(FULL_COUNT)?,
+        compliances_m_per_n: (0..others.len())
+            .map(|k| std::array::from_fn(|c| compliance(3 * k + c)))
+            .collect(),
+    })
+}
+
+/// Deflections of the reduced body beside those of the full model.
+fn deflections(body: &ReducedBody, full: &FullModel) -> Vec<DeflectionSummary> {
+    let Some(stiffness) = body.stiffness_modal.clone().cholesky() else {
+        return Vec::new();
+    };
+    let others = body.interfaces[1..].iter().zip(&full.compliances_m_per_n);
+    others
+        .map(|(interface, full_m_per_n)| {
+            let shape = interface.translation.transpose();
+            let compliance = interface.translation.clone() * stiffness.solve(&shape);
+            let reduced_m_per_n: [f64; 3] = std::array::from_fn(|c| compliance[(c, c)]);
+            DeflectionSummary {
+                interface: interface.name.clone(),
+                full_m_per_n: *full_m_per_n,
+                reduced_m_per_n,
+                lost_ratio: std::array::from_fn(|c| 1.0 - reduced_m_per_n[c] / full_m_per_n[c]),
+            }
+        })
+        .collect()
+}
+
+fn basis(body: &ReducedBody, with_payload: bool, full: Option<&FullModel>) -> BasisSummary {
     BasisSummary {
         with_payload,
         boundaries: body.report.boundary_names.clone(),
         mode_count: body.mode_count(),
         fixed_interface_hz: body.report.fixed_interface_hz.clone(),
         reduced_hz: generalised_hz(&body.stiffness_modal, &body.mass_modal),
-        full_hz: full_hz.to_vec(),
+        full_hz: full.map_or_else(Vec::new, |full| full.lowest_hz.clone()),
+        deflections: full.map_or_else(Vec::new, |full| deflections(body, full)),
     }
 }
 
@@ -305,6 +371,13 @@ pub fn payloads_kg(file: &MachineFile) -> Vec<f64> {
 const SMALL_MOTIONS_COUNT: usize = 5;
 /// Amplitude to which a motion counts as decayed, as in the SLIDE paper.
 const DECAYED: f64 = 0.01;
+
+/// SLIDE's window from eigenvalues, s: time in which the slowest damped motion in the middle of the range has decayed to a
+/// hundredth, valves shut. None where there is no equilibrium, or a motion does not decay.
+#[must_use]
+pub fn eigenvalue_window_s(simulator: &Simulator, payload_kg: f64) -> Option<f64> {
+    small_motions(simulator, payload_kg).window_s
+}
 
 fn small_motions(simulator: &Simulator, payload_kg: f64) -> SmallMotionsRow {
     let file = simulator.machine().file();
@@ -420,6 +493,28 @@ mod tests {
             let (shortest, longest) = (0.820, 0.820 + 0.535);
             assert!((shortest..longest).contains(&row.lengths_m[0]), "{row:?}");
         }
+        // a basis can only stiffen; an interface that is a boundary loses what its own nodes give way
+        let summary = summarise(&simulator).unwrap();
+        let flexible = summary.bodies[0].flexible.as_ref().unwrap();
+        for basis in &flexible.bases {
+            assert_eq!(basis.deflections.len(), flexible.interfaces.len() - 1);
+            for row in &basis.deflections {
+                let most = if basis.boundaries.contains(&row.interface) {
+                    0.06
+                } else {
+                    1.0
+                };
+                assert!(
+                    row.lost_ratio.iter().all(|lost| (-1e-9..most).contains(lost)),
+                    "{row:?}"
+                );
+            }
+        }
+        let lost_y = |basis: &BasisSummary| {
+            let row = basis.deflections.iter().find(|row| row.interface == "payload");
+            row.unwrap().lost_ratio[1]
+        };
+        assert!(lost_y(&flexible.bases[1]) < lost_y(&flexible.bases[0]));
         // the boom swings on its oil, slower with more payload, and every motion decays
         let light = small_motions(&simulator, 0.0);
         let heavy = small_motions(&simulator, 200.0);

@@ -48,7 +48,7 @@ fn the_step_loop_does_not_allocate() {
         run_id: 0,
         payload_kg: 50.0,
         angles_rad: vec![0.2],
-        valves_ratio: vec![(0..samples).map(|k| (k as f64 * 1.3).sin()).collect()],
+        valves_ratio: vec![(0..samples).map(|k| libm::sin(k as f64 * 1.3)).collect()],
     };
     for integrator in [
         Integrator::TrapezoidalIndex2 { step_s: 0.001 },
@@ -88,7 +88,11 @@ fn the_accurate_step_loop_does_not_allocate() {
                     run_id: u64::from(i),
                     payload_kg: 60.0,
                     angles_rad: vec![0.1 + 0.05 * f64::from(i)],
-                    valves_ratio: vec![(0..samples).map(|k| (0.7 * f64::from(k + 3 * i)).sin()).collect()],
+                    valves_ratio: vec![
+                        (0..samples)
+                            .map(|k| libm::sin(0.7 * f64::from(k + 3 * i)))
+                            .collect(),
+                    ],
                 })
                 .collect();
             let before = COUNT.with(Cell::get);

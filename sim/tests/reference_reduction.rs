@@ -134,7 +134,7 @@ fn stiffness_and_mass_action_agree() {
     let facts = &r.checks["stiffness"];
     let x = DMatrix::from_fn(3 * r.mesh.node_count(), 1, |i, _| {
         let i = i as f64;
-        (0.37 * (i + 1.0)).sin() + 0.5 * (0.011 * (i + 1.0)).cos()
+        libm::sin(0.37 * (i + 1.0)) + 0.5 * libm::cos(0.011 * (i + 1.0))
     });
     let k = assemble_stiffness(&r.mesh, &STEEL);
     let kx = k.multiply(&x);

@@ -410,24 +410,20 @@ def start_echo(bench, request):
     return Server("echo", process, json.loads(process.stdout.readline())["address"], "echo")
 
 
-def latency(bench, rounds, seconds):
+def latency(bench, ours, rounds, seconds):
     """p50 and p99 at half of the saturating load, one window as JSON and as bytes, beside a server that answers at once."""
     found = {}
     for name, binary in (("JSON", False), ("bytes", True)):
-        with apart() as client:
-            ours = start_ours(bench)
-            one = request_file(bench, ours, 1, binary)
-            echo = start_echo(bench, one)
-            client()
-            try:
-                most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
-                runs = {server.name: [] for server in (ours, echo)}
-                for _ in range(rounds):
-                    for server in (ours, echo):
-                        runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
-            finally:
-                ours.close()
-                echo.close()
+        one = request_file(bench, ours, 1, binary)
+        echo = start_echo(bench, one)
+        try:
+            most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
+            runs = {server.name: [] for server in (ours, echo)}
+            for _ in range(rounds):
+                for server in (ours, echo):
+                    runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
+        finally:
+            echo.close()
         found[name] = {"rate": most / 2} | {server: medians(of) for server, of in runs.items()}
         print(name, found[name], flush=True)
     return found
@@ -658,7 +654,7 @@ def report(results, arguments):
                          f"{reference['cpu_us'] / median['cpu_us']:.1f} | {us(median['p50_us'])} | {us(median['p99_us'])} |")
     if half := results.get("latency"):
         lines += ["", "## At half of the saturating load (`--only latency`)", "",
-                  "16 connections on a schedule, the service on one half of the cores and the client on the other; a latency counts from when its "
+                  "16 connections on a schedule, a sleeping thread each, on the same cores as the service; a latency counts from when its "
                   "request was due. *Echo* reads as many bytes, looks at nothing and answers at once, in turn with the service: what the machine takes by itself.", "",
                   "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | echo: p50 µs | p99 µs | best round's p99 µs |", "|---|---|---|---|---|---|---|---|"]
         lines += [f"| {name} | {f['rate']:.0f} | " + " | ".join(us(f[server][key]) for server in ("hydroflex", "echo") for key in ("p50_us", "p99_us", "best_p99_us")) + " |"
@@ -743,7 +739,7 @@ def main():
         measures = {
             "kernel": lambda: in_process(bench, arguments.rounds),
             "http": lambda: with_ours(over_http, min(arguments.rounds, 3), arguments.seconds),
-            "latency": lambda: latency(bench, arguments.rounds, arguments.seconds),
+            "latency": lambda: with_ours(latency, arguments.rounds, arguments.seconds),
             "overload": lambda: with_ours(overload, arguments.seconds),
             "streams": lambda: streams(bench, arguments.rounds, arguments.seconds),
             "memory": lambda: with_ours(memory, arguments.requests),

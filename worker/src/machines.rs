@@ -1,11 +1,15 @@
 //! Machines by reference: loaded, checked and reduced once per process, and once per cache directory.
 
 use hydroflex_ledger::blobs::{BlobError, Blobs, mesh_key};
-use hydroflex_openapi::job::{JobSpec, MachineRef, ValueOrRange};
+use hydroflex_openapi::job::{JobSpec, MachineRef, MaterialRef, ValueOrRange};
+use hydroflex_openapi::machine::MaterialSpec;
+use hydroflex_openapi::problem::FieldError;
 use hydroflex_sim::machine::{Machine, MachineError, MeshTexts};
+use hydroflex_sim::scenario::validate_materials;
 use hydroflex_sim::simulator::{Simulator, SimulatorError};
+use rayon::prelude::*;
 use std::collections::{BTreeMap, VecDeque};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 /// Machines kept in memory. A reduced boom takes a few hundred kilobytes, its mesh a few megabytes.
@@ -42,6 +46,9 @@ pub enum RefusedMachine {
     /// The file or one of its meshes is refused.
     #[error("{0}")]
     File(Arc<MachineError>),
+    /// A material of the job is none.
+    #[error("{}: {}, allowed is {}", .0.pointer, .0.detail, .0.allowed.as_deref().unwrap_or_default())]
+    Material(FieldError),
     /// The structure cannot be reduced, or the machine cannot become equations.
     #[error("{0}")]
     Structure(Arc<SimulatorError>),
@@ -53,9 +60,42 @@ pub struct ReadyMachine {
     pub sha256: String,
     /// Its simulator.
     pub simulator: Simulator,
+    /// Simulators of the same machine made of the job's materials, in the job's order.
+    of_materials: Vec<Simulator>,
 }
 
 impl ReadyMachine {
+    /// A machine of its own material and of these; reduced bodies are kept in the directory `cache`.
+    #[must_use]
+    pub fn new(machine: Machine, materials: &[MaterialSpec], cache: &Path) -> Self {
+        let cache = Some(cache.to_path_buf());
+        Self {
+            sha256: hex::encode(machine.content_hash()),
+            of_materials: materials
+                .iter()
+                .map(|material| Simulator::with_cache(machine.of_material(material), cache.clone()))
+                .collect(),
+            simulator: Simulator::with_cache(machine, cache),
+        }
+    }
+
+    /// The simulator of the machine made of one of the job's materials, or as its file says.
+    #[must_use]
+    pub fn simulator_of(&self, material: Option<usize>) -> &Simulator {
+        material
+            .and_then(|index| self.of_materials.get(index))
+            .unwrap_or(&self.simulator)
+    }
+
+    /// Every simulator that the job's runs need.
+    fn simulators(&self) -> &[Simulator] {
+        if self.of_materials.is_empty() {
+            std::slice::from_ref(&self.simulator)
+        } else {
+            &self.of_materials
+        }
+    }
+
     /// The machine.
     #[must_use]
     pub fn machine(&self) -> &Machine {
@@ -65,8 +105,13 @@ impl ReadyMachine {
 
 type Slot = Arc<OnceLock<Result<Arc<ReadyMachine>, RefusedMachine>>>;
 
-/// What a job says of its machine: the reference, and the meshes it gives by body and hash.
-type Asked = (MachineRef, BTreeMap<String, String>);
+/// What a job says of its machine: the reference, the meshes it gives by body and hash, and materials.
+#[derive(Clone, PartialEq)]
+struct Asked {
+    machine: MachineRef,
+    meshes: BTreeMap<String, String>,
+    materials: Vec<MaterialRef>,
+}
 
 /// The machines that this process has used lately.
 pub struct Machines {
@@ -90,17 +135,26 @@ impl Machines {
     /// # Errors
     /// Says why the machine is refused.
     pub fn ready(&self, spec: &JobSpec, blobs: &Blobs) -> Result<Arc<ReadyMachine>, RefusedMachine> {
-        let machine = self.loaded((spec.machine.clone(), spec.meshes.clone()), blobs)?;
+        let machine = self.loaded(spec, blobs)?;
         let with_payload = match spec.payload_kg {
             ValueOrRange::Value(value) => value > 0.0,
             ValueOrRange::Range { max, .. } => max > 0.0,
         };
         let refused = |error| RefusedMachine::Structure(Arc::new(error));
-        machine.simulator.prepare(with_payload).map_err(refused)?;
+        machine
+            .simulators()
+            .par_iter()
+            .try_for_each(|simulator| simulator.prepare(with_payload))
+            .map_err(refused)?;
         Ok(machine)
     }
 
-    fn loaded(&self, asked: Asked, blobs: &Blobs) -> Result<Arc<ReadyMachine>, RefusedMachine> {
+    fn loaded(&self, spec: &JobSpec, blobs: &Blobs) -> Result<Arc<ReadyMachine>, RefusedMachine> {
+        let asked = Asked {
+            machine: spec.machine.clone(),
+            meshes: spec.meshes.clone(),
+            materials: spec.materials.clone(),
+        };
         let slot = {
             let mut slots = self
                 .slots
@@ -111,21 +165,20 @@ impl Machines {
                 Some((_, slot)) => slot,
                 None => Slot::default(),
             };
-            slots.push_back((asked.clone(), slot.clone()));
+            slots.push_back((asked, slot.clone()));
             while slots.len() > KEPT {
                 slots.pop_front();
             }
             slot
         };
-        let (reference, meshes) = asked;
         // A store that does not answer now is no verdict on the machine, so it does not enter the slot.
         let texts = if slot.get().is_none() {
-            fetch(&meshes, blobs)?
+            fetch(&spec.meshes, blobs)?
         } else {
             MeshTexts::new()
         };
         // Outside the lock, and once: who asks for the same machine meanwhile waits for it.
-        slot.get_or_init(|| prepare(&reference, &texts, self.cache.clone()).map(Arc::new))
+        slot.get_or_init(|| prepare(spec, &texts, &self.cache).map(Arc::new))
             .clone()
     }
 }
@@ -175,15 +228,13 @@ fn load(reference: &MachineRef, meshes: &MeshTexts) -> Result<Machine, RefusedMa
     loaded.map_err(|error| RefusedMachine::File(Arc::new(error)))
 }
 
-fn prepare(
-    reference: &MachineRef,
-    meshes: &MeshTexts,
-    cache: PathBuf,
-) -> Result<ReadyMachine, RefusedMachine> {
-    let machine = load(reference, meshes)?;
-    let sha256 = hex::encode(machine.content_hash());
-    Ok(ReadyMachine {
-        sha256,
-        simulator: Simulator::with_cache(machine, Some(cache)),
-    })
+fn prepare(spec: &JobSpec, meshes: &MeshTexts, cache: &Path) -> Result<ReadyMachine, RefusedMachine> {
+    let machine = load(&spec.machine, meshes)?;
+    if let Err(errors) = validate_materials(spec, machine.file())
+        && let Some(first) = errors.into_iter().next()
+    {
+        return Err(RefusedMachine::Material(first));
+    }
+    let materials: Vec<MaterialSpec> = spec.materials.iter().filter_map(MaterialRef::material).collect();
+    Ok(ReadyMachine::new(machine, &materials, cache))
 }

@@ -2,9 +2,11 @@
 
 use crate::machines::ReadyMachine;
 use hydroflex_dataset::{RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
-use hydroflex_openapi::job::{JobSpec, RunFlag};
+use hydroflex_openapi::job::{JobSpec, RunFlag, SolverPath};
 use hydroflex_sim::scenario::{self, ScenarioError};
+use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
+use std::collections::BTreeMap;
 
 /// The run as planned, with the record that it will get if it leaves no samples.
 pub struct PlannedRun {
@@ -12,6 +14,8 @@ pub struct PlannedRun {
     pub input: RunInput,
     seed: u64,
     kind: RunKind,
+    /// Place in the job's materials, and name.
+    material: Option<(usize, String)>,
 }
 
 /// Plans run `index` of a job.
@@ -25,37 +29,53 @@ pub fn plan(
     index: u64,
 ) -> Result<PlannedRun, ScenarioError> {
     let file = machine.machine().file();
-    let (input, seed) = match kind {
-        RunKind::Job => (
-            scenario::plan_run(spec, file, &machine.simulator, index)?,
-            scenario::run_seed(spec.seed, index),
-        ),
-        RunKind::Settling => (
-            scenario::plan_settling_run(spec, file, &machine.simulator, index)?,
-            scenario::settling_run_seed(spec.seed, index),
-        ),
+    let seed = match kind {
+        RunKind::Job => scenario::run_seed(spec.seed, index),
+        RunKind::Settling => scenario::settling_run_seed(spec.seed, index),
     };
-    Ok(PlannedRun { input, seed, kind })
+    let material = scenario::material_index(spec, seed);
+    let simulator = machine.simulator_of(material);
+    Ok(PlannedRun {
+        input: match kind {
+            RunKind::Job => scenario::plan_run(spec, file, simulator, index)?,
+            RunKind::Settling => scenario::plan_settling_run(spec, file, simulator, index)?,
+        },
+        seed,
+        kind,
+        material: material.map(|index| (index, spec.materials[index].name().to_owned())),
+    })
 }
 
 impl PlannedRun {
+    fn simulator<'a>(&self, machine: &'a ReadyMachine) -> &'a Simulator {
+        machine.simulator_of(self.material.as_ref().map(|(index, _)| *index))
+    }
+
     /// Simulates. A run that does not converge, or turns non-finite, is data; a panic is not, and
     /// goes through to whoever counts attempts.
     #[must_use]
     pub fn simulate(self, spec: &JobSpec, machine: &ReadyMachine) -> RunRecord {
-        let result = machine.simulator.run(&self.input, &settings(spec));
-        self.ended(result)
+        let settings = settings(spec);
+        let simulator = self.simulator(machine);
+        let result = simulator.run(&self.input, &settings);
+        self.ended(result, simulator, &settings)
     }
 
     /// The record of a simulated run.
-    fn ended(self, result: Result<Trajectory, RunFailure>) -> RunRecord {
-        self.record(result.into())
+    fn ended(
+        self,
+        result: Result<Trajectory, RunFailure>,
+        simulator: &Simulator,
+        settings: &RunSettings,
+    ) -> RunRecord {
+        let ended = Ended::of(result, &self.input, simulator, settings);
+        self.record(ended)
     }
 
     /// The record of a run without samples.
     #[must_use]
     pub fn failed(self, reason: String) -> RunRecord {
-        self.record(Ended::failed(reason))
+        self.record(Ended::failed(reason, None))
     }
 
     fn record(self, ended: Ended) -> RunRecord {
@@ -64,6 +84,7 @@ impl PlannedRun {
             run_id: self.input.run_id,
             seed: Some(self.seed),
             payload_kg: self.input.payload_kg,
+            material: self.material.map(|(_, name)| name),
             angles_rad: self.input.angles_rad,
             outcome: ended.outcome,
             flags: ended.flags,
@@ -83,17 +104,25 @@ pub struct Ended {
 }
 
 impl Ended {
-    fn failed(reason: String) -> Self {
+    fn failed(reason: String, path: Option<SolverPath>) -> Self {
         Self {
             outcome: RunOutcome::Failed { reason },
             flags: Vec::new(),
-            statistics: RunStatistics::default(),
+            statistics: RunStatistics {
+                path,
+                ..RunStatistics::default()
+            },
         }
     }
-}
 
-impl From<Result<Trajectory, RunFailure>> for Ended {
-    fn from(result: Result<Trajectory, RunFailure>) -> Self {
+    /// What the simulator made of a run, or the path on which it failed.
+    #[must_use]
+    pub fn of(
+        result: Result<Trajectory, RunFailure>,
+        input: &RunInput,
+        simulator: &Simulator,
+        settings: &RunSettings,
+    ) -> Self {
         match result {
             Ok(trajectory) => Self {
                 statistics: RunStatistics {
@@ -101,6 +130,7 @@ impl From<Result<Trajectory, RunFailure>> for Ended {
                     rejected: trajectory.statistics.rejected,
                     iterations: trajectory.statistics.iterations,
                     factorisations: trajectory.statistics.factorisations,
+                    path: Some(trajectory.statistics.path),
                 },
                 outcome: RunOutcome::Ok(RunSamples {
                     sample_count: trajectory.sample_count,
@@ -108,7 +138,10 @@ impl From<Result<Trajectory, RunFailure>> for Ended {
                 }),
                 flags: trajectory.flags,
             },
-            Err(failure) => Self::failed(failure.to_string()),
+            Err(failure) => {
+                let path = simulator.solver_path(settings.integrator, input.payload_kg > 0.0);
+                Self::failed(failure.to_string(), path.ok())
+            }
         }
     }
 }
@@ -116,19 +149,37 @@ impl From<Result<Trajectory, RunFailure>> for Ended {
 /// Whether all of these runs can share the processor's vector registers.
 #[must_use]
 pub fn side_by_side(runs: &[PlannedRun], spec: &JobSpec, machine: &ReadyMachine) -> bool {
-    let together = |with_payload| machine.simulator.runs_side_by_side(&settings(spec), with_payload);
-    runs.iter().all(|run| together(run.input.payload_kg > 0.0))
+    let settings = settings(spec);
+    let together = |run: &PlannedRun| {
+        run.simulator(machine)
+            .runs_side_by_side(&settings, run.input.payload_kg > 0.0)
+    };
+    runs.iter().all(together)
 }
 
 /// Simulates several runs at a time, which costs a third of simulating them one by one and gives the
 /// same numbers. Panics as [`PlannedRun::simulate`] does.
 #[must_use]
 pub fn simulate_together(runs: Vec<PlannedRun>, spec: &JobSpec, machine: &ReadyMachine) -> Vec<RunRecord> {
-    let inputs: Vec<RunInput> = runs.iter().map(|run| run.input.clone()).collect();
-    let results = machine.simulator.run_batch(&inputs, &settings(spec));
+    let settings = settings(spec);
+    // Runs of one material share a simulator; a job without materials is one such group.
+    let mut groups: BTreeMap<Option<usize>, Vec<usize>> = BTreeMap::new();
+    for (place, run) in runs.iter().enumerate() {
+        let material = run.material.as_ref().map(|(index, _)| *index);
+        groups.entry(material).or_default().push(place);
+    }
+    let mut results: BTreeMap<usize, Result<Trajectory, RunFailure>> = BTreeMap::new();
+    for (material, places) in groups {
+        let inputs: Vec<RunInput> = places.iter().map(|place| runs[*place].input.clone()).collect();
+        let simulated = machine.simulator_of(material).run_batch(&inputs, &settings);
+        results.extend(places.into_iter().zip(simulated));
+    }
     runs.into_iter()
-        .zip(results)
-        .map(|(run, result)| run.ended(result))
+        .zip(results.into_values())
+        .map(|(run, result)| {
+            let simulator = run.simulator(machine);
+            run.ended(result, simulator, &settings)
+        })
         .collect()
 }
 

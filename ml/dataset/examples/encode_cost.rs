@@ -41,6 +41,7 @@ fn main() -> Result<(), Failure> {
             run_id: run.run_id,
             seed: None,
             payload_kg: 0.0,
+            material: None,
             angles_rad: vec![0.0; dataset.manifest().machine.angles.len()],
             outcome: RunOutcome::Ok(RunSamples {
                 sample_count: run.sample_count,

@@ -7,7 +7,7 @@ use arrow::datatypes::{Float32Type, Float64Type, UInt64Type};
 use arrow::error::ArrowError;
 use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::dataset::{DATASET_FORMAT, DatasetStatistics, Manifest, SplitName, WindowFacts};
-use hydroflex_openapi::job::{RunFlag, RunStatus};
+use hydroflex_openapi::job::{RunFlag, RunStatus, SolverPath};
 use parquet::arrow::ProjectionMask;
 use parquet::errors::ParquetError;
 use sha2::{Digest, Sha256};
@@ -35,6 +35,8 @@ pub struct RunRow {
     pub seed: Option<u64>,
     /// Payload.
     pub payload_kg: f64,
+    /// Material of the flexible bodies, where the job varied it.
+    pub material: Option<String>,
     /// Initial angles in the order of the machine file.
     pub angles_rad: Vec<f64>,
     /// How it ended.
@@ -43,6 +45,8 @@ pub struct RunRow {
     pub reason: Option<String>,
     /// What it met.
     pub flags: Vec<RunFlag>,
+    /// Which equations were solved; absent in data sets that do not say so.
+    pub solver_path: Option<SolverPath>,
     /// File with its samples, relative to the data set.
     pub file: Option<String>,
 }
@@ -577,11 +581,20 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         .flatten()
         .map(|name| RunFlag::from_name(name).ok_or_else(|| value_error("flags", name)))
         .collect::<Result<_, _>>()?;
+    // data sets made before these were recorded have no such columns
+    let later_text_at = |name: &str| match batch.column_by_name(name) {
+        None => Ok(None),
+        Some(_) => text_at(name),
+    };
+    let solver_path = later_text_at("solver_path")?
+        .map(|name| SolverPath::from_name(&name).ok_or_else(|| value_error("solver_path", &name)))
+        .transpose()?;
     Ok(RunRow {
         run_id: u64_at("run_id")?.unwrap_or_default(),
         split: SplitName::from_name(&split).ok_or_else(|| value_error("split", &split))?,
         seed: u64_at("seed")?,
         payload_kg: f64_at("payload_kg")?,
+        material: later_text_at("material")?,
         angles_rad: angles
             .iter()
             .map(|angle| f64_at(&format!("angle_{angle}_rad")))
@@ -593,6 +606,7 @@ fn run_row(path: &Path, batch: &RecordBatch, row: usize, angles: &[String]) -> R
         },
         reason: text_at("reason")?,
         flags,
+        solver_path,
         file: text_at("file")?,
     })
 }

@@ -230,6 +230,7 @@ pub struct Publisher<S: Sink> {
     statistics: [Vec<Accumulator>; 2],
     counts: RunCounts,
     flags: BTreeMap<String, u64>,
+    solver_paths: BTreeMap<String, u64>,
     next_index: u64,
     next_run_id: u64,
 }
@@ -315,6 +316,7 @@ impl<S: Sink> Publisher<S> {
             ],
             counts: RunCounts::default(),
             flags: BTreeMap::new(),
+            solver_paths: BTreeMap::new(),
             next_index: 0,
             next_run_id: 0,
             spec,
@@ -376,6 +378,9 @@ impl<S: Sink> Publisher<S> {
         }
         for flag in &record.flags {
             *self.flags.entry(flag.as_str().to_owned()).or_default() += 1;
+        }
+        if let Some(path) = record.statistics.path {
+            *self.solver_paths.entry(path.as_str().to_owned()).or_default() += 1;
         }
     }
 
@@ -452,6 +457,7 @@ impl<S: Sink> Publisher<S> {
             settling,
             counts,
             flags,
+            solver_paths,
             ..
         } = self;
         for part in parts.values_mut() {
@@ -479,6 +485,7 @@ impl<S: Sink> Publisher<S> {
             channels: spec.channels,
             runs: counts,
             flags,
+            solver_paths,
             files: output.sorted(),
         };
         output.write_json("manifest.json", &manifest)?;

@@ -1,6 +1,6 @@
 //! One run, between the simulator that made it and the files that keep it.
 
-use hydroflex_openapi::job::{RunFlag, RunStatus};
+use hydroflex_openapi::job::{RunFlag, RunStatus, SolverPath};
 
 /// One run: its parameters, how it ended, and its samples if it ended well.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,6 +13,8 @@ pub struct RunRecord {
     pub seed: Option<u64>,
     /// Payload.
     pub payload_kg: f64,
+    /// Material of the flexible bodies, where the job varies it.
+    pub material: Option<String>,
     /// Initial angles in the order of the machine file.
     pub angles_rad: Vec<f64>,
     /// How it ended.
@@ -93,4 +95,6 @@ pub struct RunStatistics {
     pub iterations: u64,
     /// Jacobian evaluations with factorisation.
     pub factorisations: u64,
+    /// Which equations were solved, or would have been; absent if the run never came to the solver.
+    pub path: Option<SolverPath>,
 }

@@ -9,7 +9,7 @@ use arrow::array::{
 };
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
 use hydroflex_openapi::dataset::{ManifestFile, SplitName};
-use hydroflex_openapi::job::RunStatus;
+use hydroflex_openapi::job::{RunStatus, SolverPath};
 use parquet::arrow::ArrowWriter;
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ pub struct RunPlace {
     pub row_group: u32,
 }
 
-/// Columns: `run_id, split, seed, payload_kg, angle_*_rad, status, reason, flags, solver_*, file,
+/// Columns: `run_id, split, seed, payload_kg, material, angle_*_rad, status, reason, flags, solver_*, file,
 /// row_group`.
 #[must_use]
 pub fn runs_schema(angles: &[String]) -> SchemaRef {
@@ -40,6 +40,7 @@ pub fn runs_schema(angles: &[String]) -> SchemaRef {
         Field::new("split", DataType::Utf8, false),
         Field::new("seed", DataType::UInt64, true),
         described("payload_kg", DataType::Float64, false, "kg", "mass"),
+        Field::new("material", DataType::Utf8, true),
     ];
     for angle in angles {
         let name = format!("angle_{angle}_rad");
@@ -52,6 +53,7 @@ pub fn runs_schema(angles: &[String]) -> SchemaRef {
     for count in SOLVER_COLUMNS {
         fields.push(Field::new(count, DataType::UInt64, false));
     }
+    fields.push(Field::new("solver_path", DataType::Utf8, true));
     fields.push(Field::new("file", DataType::Utf8, true));
     fields.push(Field::new("row_group", DataType::UInt32, true));
     Arc::new(Schema::new(fields))
@@ -78,11 +80,13 @@ struct Columns {
     split: StringBuilder,
     seed: UInt64Builder,
     payload_kg: Float64Builder,
+    material: StringBuilder,
     angles_rad: Vec<Float64Builder>,
     status: StringBuilder,
     reason: StringBuilder,
     flags: ListBuilder<StringBuilder>,
     solver: [UInt64Builder; 4],
+    solver_path: StringBuilder,
     file: StringBuilder,
     row_group: UInt32Builder,
 }
@@ -139,11 +143,13 @@ impl Columns {
             split: StringBuilder::new(),
             seed: UInt64Builder::new(),
             payload_kg: Float64Builder::new(),
+            material: StringBuilder::new(),
             angles_rad: (0..angles).map(|_| Float64Builder::new()).collect(),
             status: StringBuilder::new(),
             reason: StringBuilder::new(),
             flags: ListBuilder::new(StringBuilder::new()).with_field(flag),
             solver: Default::default(),
+            solver_path: StringBuilder::new(),
             file: StringBuilder::new(),
             row_group: UInt32Builder::new(),
         }
@@ -154,6 +160,7 @@ impl Columns {
         self.split.append_value(split.as_str());
         self.seed.append_option(record.seed);
         self.payload_kg.append_value(record.payload_kg);
+        self.material.append_option(record.material.as_deref());
         for (column, angle) in self.angles_rad.iter_mut().zip(&record.angles_rad) {
             column.append_value(*angle);
         }
@@ -171,6 +178,7 @@ impl Columns {
         for (column, count) in self.solver.iter_mut().zip(counts) {
             column.append_value(count);
         }
+        self.solver_path.append_option(s.path.map(SolverPath::as_str));
         self.row_group
             .append_option(place.as_ref().map(|place| place.row_group));
         self.file.append_option(place.map(|place| place.file));
@@ -182,6 +190,7 @@ impl Columns {
             Arc::new(self.split.finish()),
             Arc::new(self.seed.finish()),
             Arc::new(self.payload_kg.finish()),
+            Arc::new(self.material.finish()),
         ];
         for angle in &mut self.angles_rad {
             arrays.push(Arc::new(angle.finish()));
@@ -192,6 +201,7 @@ impl Columns {
         for count in &mut self.solver {
             arrays.push(Arc::new(count.finish()));
         }
+        arrays.push(Arc::new(self.solver_path.finish()));
         arrays.push(Arc::new(self.file.finish()));
         arrays.push(Arc::new(self.row_group.finish()));
         arrays

@@ -17,12 +17,12 @@ use arrow::datatypes::{
 use arrow::error::ArrowError;
 use arrow::ipc::reader::StreamReader;
 use arrow::ipc::writer::StreamWriter;
-use hydroflex_openapi::job::{RunFlag, SampleType};
+use hydroflex_openapi::job::{RunFlag, SampleType, SolverPath};
 use std::io::{Read, Write};
 use std::sync::Arc;
 
 /// Version of the shard format; a shard of another version is refused.
-pub const SHARD_FORMAT: &str = "hydroflex-shard-1";
+pub const SHARD_FORMAT: &str = "hydroflex-shard-2";
 
 /// A batch is written once it has this many samples per channel.
 const BATCH_ROWS: usize = 16_384;
@@ -104,6 +104,8 @@ fn fixed_fields() -> Vec<Field> {
         Field::new("rejected", DataType::UInt64, false),
         Field::new("iterations", DataType::UInt64, false),
         Field::new("factorisations", DataType::UInt64, false),
+        Field::new("path", DataType::Utf8, true),
+        Field::new("material", DataType::Utf8, true),
     ]
 }
 
@@ -222,6 +224,8 @@ struct Batch {
     reason: Vec<Option<String>>,
     flags: Vec<u32>,
     statistics: [Vec<u64>; 4],
+    path: Vec<Option<&'static str>>,
+    material: Vec<Option<String>>,
     angles: Vec<Vec<f64>>,
     offsets: Vec<i32>,
     samples: SampleColumns,
@@ -244,6 +248,8 @@ impl Batch {
             reason: Vec::new(),
             flags: Vec::new(),
             statistics: Default::default(),
+            path: Vec::new(),
+            material: Vec::new(),
             angles: vec![Vec::new(); schema.angles.len()],
             offsets: vec![0],
             samples: match schema.sample_type {
@@ -269,6 +275,8 @@ impl Batch {
         for (column, count) in self.statistics.iter_mut().zip(counts) {
             column.push(count);
         }
+        self.path.push(s.path.map(SolverPath::as_str));
+        self.material.push(record.material.clone());
         for (column, angle) in self.angles.iter_mut().zip(&record.angles_rad) {
             column.push(*angle);
         }
@@ -303,6 +311,8 @@ impl Batch {
         for counts in self.statistics {
             columns.push(Arc::new(UInt64Array::from(counts)));
         }
+        columns.push(Arc::new(StringArray::from(self.path)));
+        columns.push(Arc::new(StringArray::from(self.material)));
         for angle in self.angles {
             columns.push(Arc::new(Float64Array::from(angle)));
         }
@@ -459,6 +469,7 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
     let f64_at = |column: usize| batch.column(column).as_primitive::<Float64Type>().value(row);
     let seed = batch.column(2);
     let reason = batch.column(4);
+    let material = batch.column(11);
     let angles = fixed_fields().len();
     let outcome = if reason.is_valid(row) {
         RunOutcome::Failed {
@@ -487,6 +498,9 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
         run_id: u64_at(1),
         seed: seed.is_valid(row).then(|| u64_at(2)),
         payload_kg: f64_at(3),
+        material: material
+            .is_valid(row)
+            .then(|| material.as_string::<i32>().value(row).to_owned()),
         angles_rad: (angles..angles + schema.angles.len()).map(f64_at).collect(),
         outcome,
         flags: flags_of_bits(batch.column(5).as_primitive::<UInt32Type>().value(row))?,
@@ -495,8 +509,23 @@ fn record_at(batch: &RecordBatch, row: usize, schema: &ShardSchema) -> Result<Ru
             rejected: u64_at(7),
             iterations: u64_at(8),
             factorisations: u64_at(9),
+            path: path_at(batch.column(10), row)?,
         },
     })
+}
+
+fn path_at(column: &ArrayRef, row: usize) -> Result<Option<SolverPath>, ShardError> {
+    if column.is_null(row) {
+        return Ok(None);
+    }
+    let name = column.as_string::<i32>().value(row);
+    match SolverPath::from_name(name) {
+        Some(path) => Ok(Some(path)),
+        None => Err(ShardError::Value {
+            column: "path",
+            value: name.to_owned(),
+        }),
+    }
 }
 
 fn list_at(list: &ListArray, row: usize) -> Vec<f64> {

@@ -109,6 +109,8 @@ fn a_data_set_is_read_back_whole() {
         assert_eq!(record.run_id, row.run_id);
         assert_eq!(record.seed, row.seed);
         assert_eq!(record.flags, row.flags);
+        assert_eq!(record.statistics.path, row.solver_path);
+        assert_eq!(record.material, row.material);
         assert_eq!(record.status(), row.status);
         assert_eq!(record.reason(), row.reason.as_deref());
         let loaded = dataset.load_run(row.run_id, &names).unwrap();

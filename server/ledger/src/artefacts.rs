@@ -26,6 +26,8 @@ pub struct NewDataset {
     pub runs: u64,
     /// Files, sorted by path.
     pub files: Vec<FileEntry>,
+    /// [`crate::JobRecord::round`] of the job when its shards were read.
+    pub round: u64,
 }
 
 /// A model whose files are all in the store.
@@ -115,7 +117,7 @@ async fn finish_job(tx: &mut Transaction, job: JobId) -> Result<(), LedgerError>
 
 impl Ledger {
     /// Makes a data set visible, ties it to its job and opens the job's trainings, all at once.
-    /// False if the job is no longer being published.
+    /// False if the job is no longer being published, or was begun again since its shards were read.
     ///
     /// # Errors
     /// Passes on what the database says.
@@ -128,8 +130,8 @@ impl Ledger {
         let mut tx = self.pool.begin().await?;
         let changed = tx
             .execute(
-                "UPDATE jobs SET dataset_id = $2 WHERE id = $1 AND state = 'publishing'",
-                values![job.to_string(), dataset.id.as_str()],
+                "UPDATE jobs SET dataset_id = $2 WHERE id = $1 AND state = 'publishing' AND round = $3",
+                values![job.to_string(), dataset.id.as_str(), dataset.round],
             )
             .await?;
         if changed == 0 {

@@ -7,7 +7,7 @@ use crate::{Ledger, LedgerError, ShardKind, clock, shards};
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::JobSpec;
-use hydroflex_openapi::status::{JobState, TimeSplit};
+use hydroflex_openapi::status::{JobNotice, JobState, TimeSplit};
 use sha2::{Digest, Sha256};
 
 /// A job as it is accepted: checked, defaults filled in.
@@ -21,7 +21,12 @@ pub struct NewJob {
     pub settling_shards: Vec<u64>,
     /// Sizes of the first shards of runs, in run order.
     pub run_shards: Vec<u64>,
+    /// Remarks on the job; the first eight are kept.
+    pub notices: Vec<JobNotice>,
 }
+
+/// Remarks that a job can have.
+pub(crate) const NOTICES_MOST: usize = 8;
 
 /// A key that makes a request safe to repeat.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -161,6 +166,10 @@ impl Ledger {
             },
         )
         .await?;
+        for notice in new.notices.iter().take(NOTICES_MOST) {
+            let notice = notice.clone();
+            append(&mut tx, id, &EventKind::Notice { notice }).await?;
+        }
         shards::plan(&mut tx, id, ShardKind::Settling, 0, &new.settling_shards).await?;
         shards::plan(&mut tx, id, ShardKind::Runs, 0, &new.run_shards).await?;
         tx.commit().await?;
@@ -180,6 +189,19 @@ impl Ledger {
             )
             .await?;
         Ok(row.is_some())
+    }
+
+    /// Remarks with which a job was accepted: events right after its first one.
+    ///
+    /// # Errors
+    /// Passes on what the database says.
+    pub async fn notices(&self, job: JobId) -> Result<Vec<JobNotice>, LedgerError> {
+        let first = self.events(job, 1, NOTICES_MOST as u64).await?;
+        let notices = first.into_iter().map_while(|event| match event.what {
+            EventKind::Notice { notice } => Some(notice),
+            _ => None,
+        });
+        Ok(notices.collect())
     }
 
     /// One job.
@@ -391,7 +413,7 @@ impl Ledger {
             .await?;
             tx.execute(
                 "UPDATE jobs SET runs_done = runs_done - $2, runs_failed = runs_failed - $2, \
-                 settling_done = settling_done - $3, finished_ms = NULL WHERE id = $1",
+                 settling_done = settling_done - $3, finished_ms = NULL, round = round + 1 WHERE id = $1",
                 values![id.as_str(), runs, settling],
             )
             .await?;

@@ -46,13 +46,14 @@ pub use workers::Beat;
 use engine::{Pool, values};
 
 /// One script per schema version, in order; a released one never changes.
-const SCHEMA: [&str; 6] = [
+const SCHEMA: [&str; 7] = [
     include_str!("../migrations/0001_ledger.sql"),
     include_str!("../migrations/0002_aliases.sql"),
     include_str!("../migrations/0003_keys.sql"),
     include_str!("../migrations/0004_instruction_sets.sql"),
     include_str!("../migrations/0005_uploads.sql"),
     include_str!("../migrations/0006_sweeps.sql"),
+    include_str!("../migrations/0007_rounds.sql"),
 ];
 
 /// The shared record of what is to be done and what is done.

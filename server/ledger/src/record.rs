@@ -34,6 +34,8 @@ pub struct JobRecord {
     pub reason: Option<String>,
     /// Data set, once published.
     pub dataset_id: Option<DatasetId>,
+    /// How often it was begun again by a retry: what was read of it in one round is not published in another.
+    pub round: u64,
     /// Sequence of its last event.
     pub last_sequence: u64,
     /// When it was accepted, ms since 1970.
@@ -93,6 +95,7 @@ impl JobRecord {
             progress,
             reason: row.optional_text("reason")?,
             dataset_id: row.parse_optional("dataset_id")?,
+            round: row.count("round")?,
             last_sequence: row.count("last_sequence")?,
             created_ms: row.int("created_ms")?,
             started_ms,

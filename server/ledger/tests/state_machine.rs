@@ -104,6 +104,7 @@ async fn play(steps: Vec<Step>) {
         machine_sha256: String::new(),
         settling_shards: Vec::new(),
         run_shards: SIZES.to_vec(),
+        notices: Vec::new(),
     };
     let job = ledger.create_job(&new, None).await.unwrap().id();
 

@@ -221,6 +221,9 @@ fn print(status: &JobStatus, json: bool) -> anyhow::Result<()> {
     if let Some(reason) = &status.reason {
         super::print_line(format_args!("reason   {reason}"))?;
     }
+    for notice in &status.notices {
+        super::print_line(format_args!("notice   {}: {}", notice.pointer, notice.detail))?;
+    }
     super::print_line(format_args!(
         "runs     {} of {} done, {} failed",
         progress.runs_done, progress.runs_total, progress.runs_failed

@@ -236,6 +236,21 @@ fn body_text(out: &mut String, body: &BodySummary) -> std::fmt::Result {
         if !basis.full_hz.is_empty() {
             writeln!(out, "    full model     {} Hz …", hertz(&basis.full_hz))?;
         }
+        for row in &basis.deflections {
+            let micrometres = row.reduced_m_per_n.map(|m| 1e9 * m);
+            let lost = row.lost_ratio.map(|part| 100.0 * part);
+            writeln!(
+                out,
+                "    1 kN at {:10} x {:.3} (-{:.3} %)  y {:.3} (-{:.3} %)  z {:.3} (-{:.3} %) µm",
+                row.interface, micrometres[0], lost[0], micrometres[1], lost[1], micrometres[2], lost[2]
+            )?;
+        }
+    }
+    if flexible.bases.iter().any(|basis| !basis.deflections.is_empty()) {
+        writeln!(
+            out,
+            "  (deflection along a force on an interface, first interface held; in brackets what the reduction lost of it)"
+        )?;
     }
     Ok(())
 }

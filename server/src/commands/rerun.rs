@@ -146,12 +146,16 @@ fn as_json(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> serde_jso
         "run_id": record.run_id,
         "seed": record.seed,
         "payload_kg": record.payload_kg,
+        "material": record.material,
         "angles": angles,
         "status": record.status(),
         "reason": record.reason(),
         "flags": record.flags.iter().map(|flag| flag.as_str()).collect::<Vec<_>>(),
         "steps": record.statistics.steps,
         "rejected": record.statistics.rejected,
+        "iterations": record.statistics.iterations,
+        "factorisations": record.statistics.factorisations,
+        "solver_path": record.statistics.path,
         "wall_s": wall_s,
         "channels": channels,
     })
@@ -164,6 +168,9 @@ fn show(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> anyhow::Resu
         line("seed", seed.to_string())?;
     }
     line("payload", format!("{} kg", record.payload_kg))?;
+    if let Some(material) = &record.material {
+        line("material", material.clone())?;
+    }
     for (angle, value) in machine.machine().file().angles.iter().zip(&record.angles_rad) {
         line(&angle.name, format!("{:.6} deg at the start", value.to_degrees()))?;
     }
@@ -178,8 +185,14 @@ fn show(record: &RunRecord, machine: &ReadyMachine, wall_s: f64) -> anyhow::Resu
     let statistics = &record.statistics;
     line(
         "steps",
-        format!("{}, {} rejected", statistics.steps, statistics.rejected),
+        format!(
+            "{}, {} rejected, {} factorisations",
+            statistics.steps, statistics.rejected, statistics.factorisations
+        ),
     )?;
+    if let Some(path) = statistics.path {
+        line("solver", path.as_str().to_owned())?;
+    }
     if let RunOutcome::Ok(samples) = &record.outcome {
         super::print_line(format_args!(
             "\n{:40} {:>14} {:>14} {:>14} {:>14}",

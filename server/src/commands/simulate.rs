@@ -8,7 +8,7 @@ use hydroflex_openapi::dataset::{CodeFacts, DatasetSource, MachineFacts};
 use hydroflex_openapi::job::{Integrator, SampleType, Split};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
+use hydroflex_sim::trajectory::{RunInput, RunSettings};
 use hydroflex_worker::run::Ended;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
@@ -241,16 +241,18 @@ fn simulate(
     let results = simulator.run_batch(runs, settings);
     bar.inc(runs.len() as u64);
     let records = runs.iter().zip(results);
-    records.map(|(run, result)| record(run, result)).collect()
+    records
+        .map(|(run, result)| record(run, Ended::of(result, run, simulator, settings)))
+        .collect()
 }
 
-fn record(run: &RunInput, result: Result<Trajectory, RunFailure>) -> RunRecord {
-    let ended = Ended::from(result);
+fn record(run: &RunInput, ended: Ended) -> RunRecord {
     RunRecord {
         kind: RunKind::Job,
         run_id: run.run_id,
         seed: None,
         payload_kg: run.payload_kg,
+        material: None,
         angles_rad: run.angles_rad.clone(),
         outcome: ended.outcome,
         flags: ended.flags,
@@ -280,6 +282,7 @@ fn report(args: &Args, published: &Published, wall_s: f64) -> anyhow::Result<()>
             "machine_sha256": manifest.machine.content_sha256,
             "runs": manifest.runs,
             "flags": manifest.flags,
+            "solver_paths": manifest.solver_paths,
             "files": published.files.len(),
             "bytes": bytes,
             "wall_s": wall_s,
@@ -294,6 +297,12 @@ fn report(args: &Args, published: &Published, wall_s: f64) -> anyhow::Result<()>
             bytes as f64 / 1e6,
             args.out.display()
         )?;
+        let paths: Vec<String> = manifest
+            .solver_paths
+            .iter()
+            .map(|(path, runs)| format!("{path} {runs}"))
+            .collect();
+        writeln!(out, "solver path (runs): {}", paths.join(", "))?;
         writeln!(out, "sha256 {}", published.dataset_sha256)?;
     }
     Ok(())

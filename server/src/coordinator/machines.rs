@@ -1,5 +1,6 @@
 //! Machines at the front desk: refused before anything runs, with the field at fault.
 
+use super::notices;
 use hydroflex_dataset::PublishSpec;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_openapi::catalogue::MachineInfo;
@@ -7,6 +8,7 @@ use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
 use hydroflex_openapi::job::{JobSpec, MachineRef};
 use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
 use hydroflex_openapi::problem::FieldError;
+use hydroflex_openapi::status::JobNotice;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario;
 use hydroflex_worker::machines::{Machines, ReadyMachine, RefusedMachine};
@@ -49,6 +51,17 @@ impl MachineDesk {
             }
         }
     }
+
+    /// Remarks on a job of this machine.
+    pub async fn notices(&self, machine: Arc<CheckedMachine>, spec: &JobSpec) -> Vec<JobNotice> {
+        let spec = spec.clone();
+        let found = tokio::task::spawn_blocking(move || notices::of(machine.ready(), &spec)).await;
+        found.unwrap_or_else(|panic| {
+            // No job is refused because a remark on it fails.
+            tracing::error!(%panic, "a job made the look for remarks panic");
+            Vec::new()
+        })
+    }
 }
 
 fn refusal(spec: &JobSpec, refused: &RefusedMachine) -> FieldError {
@@ -63,6 +76,7 @@ fn refusal(spec: &JobSpec, refused: &RefusedMachine) -> FieldError {
                 .value(sha256.as_str())
                 .allowed("the mesh_sha256 that POST /v1/meshes answered")
         }
+        (_, RefusedMachine::Material(error)) => error.clone(),
         (_, RefusedMachine::Store { body, .. }) => {
             FieldError::new(format!("/meshes/{body}"), refused.to_string())
         }
@@ -117,7 +131,9 @@ impl CheckedMachine {
         if !errors.is_empty() {
             return Err(errors);
         }
-        let part = scenario::reachable_part(spec, file, &self.0.simulator, REACH_DRAWS);
+        // Any material will do: lengths are those of the undeformed machine.
+        let simulator = self.0.simulator_of((!spec.materials.is_empty()).then_some(0));
+        let part = scenario::reachable_part(spec, file, simulator, REACH_DRAWS);
         if part < REACH_LEAST {
             return Err(vec![FieldError::new(
                 "/initial_angle_deg",

@@ -4,6 +4,7 @@
 //! twice beside itself: each step below is a transaction that counts once.
 
 pub mod machines;
+pub mod notices;
 pub mod plan;
 pub mod publish;
 pub mod train;
@@ -148,6 +149,7 @@ impl Coordinator {
             machine_sha256: machine.sha256().to_owned(),
             settling_shards: shard_sizes(settling),
             run_shards: shard_sizes(situation),
+            notices: self.0.machines.notices(machine, &spec).await,
             spec,
         })
     }

@@ -180,6 +180,7 @@ async fn publish_if_wanted(coordinator: &Coordinator, job: &JobRecord) -> Result
         spec: job.spec.clone(),
         runs: job.spec.runs,
         files,
+        round: job.round,
     };
     let visible = coordinator
         .ledger()
@@ -268,7 +269,7 @@ async fn feed(
         let Some(now) = coordinator.ledger().job(job.id).await? else {
             return Err(PublishFailure::Over);
         };
-        if now.state.is_final() {
+        if now.state.is_final() || now.round != job.round {
             return Err(PublishFailure::Over);
         }
         let before = next;

@@ -149,6 +149,7 @@ async fn show_job(ledger: &Ledger, id: JobId) -> Result<JobStatus, ApiError> {
 /// Passes on what the ledger says.
 pub async fn status_of(ledger: &Ledger, record: JobRecord) -> Result<JobStatus, LedgerError> {
     let trainings = ledger.trainings_of(record.id).await?;
+    let notices = ledger.notices(record.id).await?;
     let dataset = match &record.dataset_id {
         Some(id) => ledger.dataset(id).await?,
         None => None,
@@ -160,6 +161,7 @@ pub async fn status_of(ledger: &Ledger, record: JobRecord) -> Result<JobStatus, 
         spec: record.spec,
         machine_sha256: record.machine_sha256,
         instruction_set: record.instruction_set,
+        notices,
         progress: record.progress,
         dataset_id: record.dataset_id,
         dataset_sha256: dataset.map(|dataset| dataset.sha256),

@@ -35,6 +35,7 @@ pub(crate) async fn register_folder(ledger: &Ledger, blobs: &Blobs, path: &Path)
         machine_sha256: hash(b""),
         settling_shards: Vec::new(),
         run_shards: vec![1],
+        notices: Vec::new(),
     };
     let job = ledger.create_job(&new, None).await.unwrap().id();
     let worker = format!("worker.{job}");
@@ -51,6 +52,7 @@ pub(crate) async fn register_folder(ledger: &Ledger, blobs: &Blobs, path: &Path)
     assert!(ledger.begin_publishing(job).await.unwrap());
     let dataset_sha256 = hash(job.to_string().as_bytes());
     let dataset = NewDataset {
+        round: 0,
         id: DatasetId::of_sha256(&dataset_sha256).unwrap(),
         sha256: dataset_sha256,
         spec,

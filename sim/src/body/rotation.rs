@@ -40,7 +40,7 @@ pub fn rate_map(theta: &Vector4<f64>) -> Matrix3x4<f64> {
 /// Euler parameters of a rotation by `angle_rad` about the global Z axis.
 #[must_use]
 pub fn euler_parameters_about_z(angle_rad: f64) -> Vector4<f64> {
-    let (sin, cos) = (0.5 * angle_rad).sin_cos();
+    let (sin, cos) = libm::sincos(0.5 * angle_rad);
     Vector4::new(cos, 0.0, 0.0, sin)
 }
 
@@ -55,7 +55,7 @@ pub fn exponential(v: &Vector3<f64>) -> Matrix3<f64> {
             0.5 - phi2 / 24.0 + phi2 * phi2 / 720.0,
         )
     } else {
-        (phi.sin() / phi, (1.0 - phi.cos()) / phi2)
+        (libm::sin(phi) / phi, (1.0 - libm::cos(phi)) / phi2)
     };
     let s = skew(v);
     Matrix3::identity() + s * a + s * s * b
@@ -73,7 +73,7 @@ pub fn tangent(v: &Vector3<f64>) -> Matrix3<f64> {
             1.0 / 6.0 - phi2 / 120.0 + phi2 * phi2 / 5040.0,
         )
     } else {
-        ((1.0 - phi.cos()) / phi2, (1.0 - phi.sin() / phi) / phi2)
+        ((1.0 - libm::cos(phi)) / phi2, (1.0 - libm::sin(phi) / phi) / phi2)
     };
     let s = skew(v);
     Matrix3::identity() - s * b + s * s * c

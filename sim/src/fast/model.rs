@@ -356,7 +356,7 @@ impl PlanarModel {
         let rod = &self.rod * &modes.phi;
         let weight = &self.first_moment * &modes.phi;
         let all: Vec<usize> = (0..modes.w2.len()).collect();
-        let reach = |k: usize| rod[(0, k)].hypot(rod[(1, k)]);
+        let reach = |k: usize| libm::hypot(rod[(0, k)], rod[(1, k)]);
         let amplitude: Vec<f64> = all
             .iter()
             .map(|&k| {

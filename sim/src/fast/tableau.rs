@@ -93,7 +93,7 @@ mod tests {
         let fine = integrate(&RODAS5P, 400);
         let coarse = (integrate(&RODAS5P, 8) - fine).abs();
         let halved = (integrate(&RODAS5P, 16) - fine).abs();
-        let seen = (coarse / halved).log2();
+        let seen = libm::log2(coarse / halved);
         // Half an order of slack: higher terms still show at these steps.
         assert!((seen - 5.0).abs() < 0.6, "order {seen}");
     }

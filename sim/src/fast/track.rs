@@ -5,7 +5,7 @@ use super::constants::Cylinder;
 use super::record::MACHINE_CHANNELS;
 use super::schedule::{Piece, pieces};
 use crate::trajectory::{RunFailure, RunInput, SolverStatistics, Trajectory};
-use hydroflex_openapi::job::RunFlag;
+use hydroflex_openapi::job::{RunFlag, SolverPath};
 
 /// Attempts within one piece of signal before a run is given up: two thousand times the usual one.
 const ATTEMPTS: u32 = 2000;
@@ -124,7 +124,10 @@ impl<'a> Track<'a> {
             shut: false,
             empty: [false; 2],
             flags: 0,
-            statistics: SolverStatistics::default(),
+            statistics: SolverStatistics {
+                path: SolverPath::Planar,
+                ..SolverStatistics::default()
+            },
             columns: (0..channels).map(|_| Vec::with_capacity(rows)).collect(),
         };
         track.enter_sample(length_m, cylinder);

@@ -250,7 +250,7 @@ mod tests {
         let mut x = quadratic(corners());
         for (i, x) in x.iter_mut().enumerate().skip(4) {
             let i = f64::from(u32::try_from(i).unwrap());
-            *x += Vector3::new((3.0 * i).sin(), (5.0 * i).cos(), (7.0 * i).sin()) * 0.004;
+            *x += Vector3::new(libm::sin(3.0 * i), libm::cos(5.0 * i), libm::sin(7.0 * i)) * 0.004;
         }
         x
     }

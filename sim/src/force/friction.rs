@@ -32,7 +32,7 @@ pub fn force(spec: &FrictionSpec, velocity_m_per_s: f64) -> LineForce {
             transition_velocity_m_per_s,
         } => {
             let r = v / transition_velocity_m_per_s;
-            let tanh = (4.0 * r).tanh();
+            let tanh = libm::tanh(4.0 * r);
             let bell = 0.25 * r * r + 0.75;
             let extra = static_n - coulomb_n;
             let force = coulomb_n * tanh + extra * r / (bell * bell) + viscous_n_s_per_m * v;
@@ -52,7 +52,7 @@ pub fn force(spec: &FrictionSpec, velocity_m_per_s: f64) -> LineForce {
                 let slope = (dynamic_n + static_offset_n) / regularisation_velocity_m_per_s;
                 (slope * v, slope)
             } else {
-                let decaying = static_offset_n * (-beyond / decay_velocity_m_per_s).exp();
+                let decaying = static_offset_n * libm::exp(-beyond / decay_velocity_m_per_s);
                 (
                     (dynamic_n + decaying).copysign(v),
                     -decaying / decay_velocity_m_per_s,
@@ -109,7 +109,7 @@ mod tests {
     fn brown_mcphee_has_its_named_values() {
         let law = laws()[0];
         // At the transition velocity: F_c tanh 4 + (F_s − F_c) + σ₂ v_t, close to static friction.
-        let expected = 210.0 * 4.0_f64.tanh() + 90.0 + 330.0 * 5e-3;
+        let expected = 210.0 * libm::tanh(4.0) + 90.0 + 330.0 * 5e-3;
         assert!((force(&law, 5e-3).force_n - expected).abs() < 1e-10);
         // Far beyond it Coulomb and viscous friction remain.
         let far = force(&law, 1.0).force_n;

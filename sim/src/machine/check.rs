@@ -4,7 +4,7 @@ use super::error::{MachineError, Problem};
 use super::text::MachineText;
 use hydroflex_openapi::machine::{
     AngleSpec, Attachment, BodySpec, Boundary, CylinderSpec, DampingSpec, FlexibleBodySpec, FrictionSpec,
-    MACHINE_FORMAT, MachineFile, RigidBodySpec, Selection, SensorQuantity, SensorSpec,
+    MACHINE_FORMAT, MachineFile, MaterialSpec, RigidBodySpec, Selection, SensorQuantity, SensorSpec,
 };
 use nalgebra::{Matrix3, Vector3};
 use std::collections::BTreeSet;
@@ -33,6 +33,27 @@ type Checked = Result<(), MachineError>;
 /// Checks the whole file.
 pub(super) fn check(text: &MachineText<'_>, file: &MachineFile) -> Checked {
     Checker { text, file }.all()
+}
+
+/// Numbers of a material: key, value, allowed range, unit.
+pub(crate) fn material_numbers(
+    material: &MaterialSpec,
+) -> [(&'static str, f64, (f64, f64), &'static str); 3] {
+    [
+        (
+            "youngs_modulus_pa",
+            material.youngs_modulus_pa,
+            plausible::YOUNGS_MODULUS_PA,
+            "Pa",
+        ),
+        ("poisson_ratio", material.poisson_ratio, (-0.99, 0.499), ""),
+        (
+            "density_kg_per_m3",
+            material.density_kg_per_m3,
+            plausible::DENSITY_KG_PER_M3,
+            "kg/m³",
+        ),
+    ]
 }
 
 struct Checker<'a> {
@@ -117,23 +138,10 @@ impl Checker<'_> {
     }
 
     fn flexible(&self, at: &str, body: &FlexibleBodySpec) -> Checked {
-        let material = &body.material;
         let key = |name: &str| format!("{at}.{name}");
-        let (e, nu) = (material.youngs_modulus_pa, material.poisson_ratio);
-        self.range(
-            &key("material.youngs_modulus_pa"),
-            e,
-            plausible::YOUNGS_MODULUS_PA,
-            "Pa",
-        )?;
-        self.range(&key("material.poisson_ratio"), nu, (-0.99, 0.499), "")?;
-        let density = material.density_kg_per_m3;
-        self.range(
-            &key("material.density_kg_per_m3"),
-            density,
-            plausible::DENSITY_KG_PER_M3,
-            "kg/m³",
-        )?;
+        for (name, value, range, unit) in material_numbers(&body.material) {
+            self.range(&key(&format!("material.{name}")), value, range, unit)?;
+        }
         self.range(
             &key("normal_modes"),
             body.normal_modes as f64,

@@ -11,12 +11,13 @@ mod from_spec;
 mod reach;
 mod text;
 
+pub(crate) use check::material_numbers;
 pub use error::{MachineError, MeshArgumentProblem, Place, Problem};
 pub use flexible::{FlexibleBody, REDUCTION_VERSION};
 
 use crate::fe::read_abaqus;
 use crate::reduction::{ReducedBody, ReductionError, cached};
-use hydroflex_openapi::machine::{BodySpec, MachineFile, MeshSource};
+use hydroflex_openapi::machine::{BodySpec, MachineFile, MaterialSpec, MeshSource};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -178,6 +179,22 @@ impl Machine {
     #[must_use]
     pub fn text(&self) -> &str {
         &self.text
+    }
+
+    /// The same machine with every flexible body of one material. Damping factors stay. Its text is that of this machine,
+    /// and so is its content hash: who varies materials names them beside it.
+    #[must_use]
+    pub fn of_material(&self, material: &MaterialSpec) -> Self {
+        let mut machine = self.clone();
+        for body in &mut machine.file.bodies {
+            if let BodySpec::Flexible(body) = body {
+                body.material = material.clone();
+            }
+        }
+        for body in &mut machine.flexible {
+            body.material = material.into();
+        }
+        machine
     }
 
     /// Flexible bodies in the file's order.

@@ -4,7 +4,7 @@ use super::error::{MachineError, Problem};
 use super::text::MachineText;
 use super::{FlexibleBody, Machine};
 use hydroflex_openapi::machine::{Attachment, CylinderSpec, JointKind};
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::Vector3;
 
 impl Machine {
     /// Point of an attachment in its body's frame, undeformed, m.
@@ -40,9 +40,10 @@ impl Machine {
         } else {
             (&joint.to, &joint.from)
         };
-        let rotation = Rotation3::from_axis_angle(&Vector3::z_axis(), angle_rad);
+        let (sin, cos) = libm::sincos(angle_rad);
         let arm = self.attachment_point_m(moving)? - self.attachment_point_m(turning)?;
-        let eye = self.attachment_point_m(fixed)? + rotation * arm;
+        let eye = self.attachment_point_m(fixed)?
+            + Vector3::new(cos * arm.x - sin * arm.y, sin * arm.x + cos * arm.y, arm.z);
         Some((eye - self.attachment_point_m(ground)?).norm())
     }
 

@@ -117,6 +117,61 @@ pub fn free_free_hz(
     Ok(elastic.filter(|hz| *hz > 1e-3 * scale_hz).collect())
 }
 
+/// The full model with some nodes held, factored once: what a reduction is measured against.
+pub struct ClampedModel<'a> {
+    stiffness: &'a BlockMatrix,
+    mass: &'a NodalMass,
+    factor: StiffnessFactor,
+}
+
+impl<'a> ClampedModel<'a> {
+    /// Factors the stiffness over the nodes that are not held.
+    ///
+    /// # Errors
+    /// As [`reduce`], where the held nodes do not hold the body.
+    pub fn new(
+        stiffness: &'a BlockMatrix,
+        mass: &'a NodalMass,
+        is_fixed: &[bool],
+    ) -> Result<Self, ReductionError> {
+        Ok(Self {
+            stiffness,
+            mass,
+            factor: StiffnessFactor::new(stiffness, mass, 0.0, is_fixed)?,
+        })
+    }
+
+    /// Number of nodes, held ones counted.
+    #[must_use]
+    pub fn node_count(&self) -> usize {
+        self.mass.node_count()
+    }
+
+    /// Lowest frequencies, Hz.
+    ///
+    /// # Errors
+    /// If the search for them does not settle.
+    pub fn lowest_hz(&self, count: usize) -> Result<Vec<f64>, ReductionError> {
+        let modes = lowest_modes(&self.factor, self.mass, 0.0, count)?;
+        Ok(modes.omega_squared.iter().copied().map(hertz).collect())
+    }
+
+    /// Static displacements under nodal loads: 3·nodes × k, m for N; zero at the held nodes.
+    #[must_use]
+    pub fn deflections_m(&self, loads_n: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut nodal = DMatrix::zeros(loads_n.nrows(), loads_n.ncols());
+        let mut free = DMatrix::zeros(self.factor.size(), loads_n.ncols());
+        // The second pass takes the rounding of the factor away.
+        for _ in 0..2 {
+            let mut correction = self.factor.gather(&(loads_n - self.stiffness.multiply(&nodal)));
+            self.factor.solve_in_place(&mut correction);
+            free += correction;
+            self.factor.scatter(&free, &mut nodal);
+        }
+        nodal
+    }
+}
+
 /// Lowest frequencies with the given nodes held, Hz.
 ///
 /// # Errors
@@ -127,9 +182,7 @@ pub fn clamped_hz(
     is_fixed: &[bool],
     count: usize,
 ) -> Result<Vec<f64>, ReductionError> {
-    let factor = StiffnessFactor::new(stiffness, mass, 0.0, is_fixed)?;
-    let modes = lowest_modes(&factor, mass, 0.0, count)?;
-    Ok(modes.omega_squared.iter().copied().map(hertz).collect())
+    ClampedModel::new(stiffness, mass, is_fixed)?.lowest_hz(count)
 }
 
 fn hertz(omega_squared: f64) -> f64 {

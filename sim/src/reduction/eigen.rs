@@ -105,7 +105,7 @@ pub(super) fn lowest_modes(
 fn start_block(n: usize, width: usize) -> DMatrix<f64> {
     DMatrix::from_fn(n, width, |row, column| {
         let (i, j) = (row as f64 + 1.0, column as f64 + 1.0);
-        (0.37 * i * (1.0 + 0.11 * j)).sin() + 0.5 * (0.011 * i + j).cos() + 0.1 * j
+        libm::sin(0.37 * i * (1.0 + 0.11 * j)) + 0.5 * libm::cos(0.011 * i + j) + 0.1 * j
     })
 }
 

@@ -10,7 +10,9 @@ mod inertia_integrals;
 mod reduced_body;
 
 pub use cache::cached;
-pub use craig_bampton::{FlexibleModel, ModeBasis, clamped_hz, free_free_hz, mode_basis, reduce};
+pub use craig_bampton::{
+    ClampedModel, FlexibleModel, ModeBasis, clamped_hz, free_free_hz, mode_basis, reduce,
+};
 pub use damping::Damping;
 pub use reduced_body::{ReducedBody, ReducedInterface, ReducedNode, ReductionReport};
 

@@ -1,9 +1,10 @@
 //! Is a job one that can be run on this machine? If not: which field, what value, what is allowed.
 
+use crate::machine::material_numbers;
 use crate::trajectory::channels;
 use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::job::{Excitation, Integrator, JobSpec, TrainingSpec, ValueOrRange, WindowRule};
-use hydroflex_openapi::machine::MachineFile;
+use hydroflex_openapi::machine::{BodySpec, MachineFile, MaterialSpec};
 use hydroflex_openapi::problem::FieldError;
 use serde::Serialize;
 use serde_json::Value;
@@ -14,6 +15,8 @@ pub const MAX_RUNS: u64 = 100_000_000;
 pub const MAX_STEPS: f64 = 1_000_000.0;
 /// Settling runs of a job.
 pub const MAX_SETTLING_RUNS: u64 = 10_000;
+/// Materials of a job; bodies are reduced for each.
+pub const MAX_MATERIALS: usize = 16;
 /// Networks of a job.
 pub const MAX_TRAININGS: usize = 256;
 
@@ -26,6 +29,7 @@ pub fn validate(spec: &JobSpec, machine: &MachineFile) -> Result<(), Vec<FieldEr
     size(spec, &mut errors);
     time(spec, &mut errors);
     payload(spec, machine, &mut errors);
+    materials(spec, machine, &mut errors);
     angles(spec, machine, &mut errors);
     excitation(spec, machine, &mut errors);
     split(spec, &mut errors);
@@ -136,6 +140,69 @@ fn payload(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
         ValueOrRange::Range { min, max } => fits(min) && fits(max) && min <= max,
     };
     errors.require(holds, "/payload_kg", spec.payload_kg, allowed);
+}
+
+/// Checks the materials of a job alone: bodies are reduced of them before the rest of a job is looked at.
+///
+/// # Errors
+/// The fields that must change.
+pub fn validate_materials(spec: &JobSpec, machine: &MachineFile) -> Result<(), Vec<FieldError>> {
+    let mut errors = Errors(Vec::new());
+    materials(spec, machine, &mut errors);
+    if errors.0.is_empty() {
+        Ok(())
+    } else {
+        Err(errors.0)
+    }
+}
+
+fn materials(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
+    let listed = &spec.materials;
+    errors.require(
+        listed.len() <= MAX_MATERIALS,
+        "/materials",
+        listed.len(),
+        format!("at most {MAX_MATERIALS} materials"),
+    );
+    let is_flexible = |body: &BodySpec| matches!(body, BodySpec::Flexible(_));
+    errors.require(
+        listed.is_empty() || machine.bodies.iter().any(is_flexible),
+        "/materials",
+        listed.len(),
+        format!("none: machine {} has no flexible body", machine.name),
+    );
+    for (k, material) in listed.iter().enumerate() {
+        let pointer = format!("/materials/{k}");
+        let name = material.name();
+        errors.require(
+            !listed[..k].iter().any(|other| other.name() == name),
+            &pointer,
+            name,
+            "every name once",
+        );
+        let Some(numbers) = material.material() else {
+            let known = MaterialSpec::NAMES.join(", ");
+            let allowed = format!(
+                "{known}, or {{\"name\", \"youngs_modulus_pa\", \"poisson_ratio\", \"density_kg_per_m3\"}}"
+            );
+            errors.require(false, pointer, name, allowed);
+            continue;
+        };
+        errors.require(
+            (1..=64).contains(&name.chars().count()) && !name.chars().any(char::is_control),
+            format!("{pointer}/name"),
+            name,
+            "1 to 64 characters on one line",
+        );
+        for (key, value, (low, high), unit) in material_numbers(&numbers) {
+            errors.require(
+                (low..=high).contains(&value),
+                format!("{pointer}/{key}"),
+                value,
+                format!("{low:e} to {high:e} {unit}").trim_end(),
+            );
+        }
+    }
 }
 
 fn angles(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {

@@ -1,6 +1,6 @@
 //! What goes into a run and what comes out.
 
-use hydroflex_openapi::job::{Integrator, RunFlag};
+use hydroflex_openapi::job::{Integrator, RunFlag, SolverPath};
 
 mod channels;
 mod failure;
@@ -57,30 +57,6 @@ pub struct SolverStatistics {
     pub iterations: u64,
     /// Jacobian evaluations with factorisation.
     pub factorisations: u64,
-    /// Which equations were integrated.
+    /// Which equations were solved.
     pub path: SolverPath,
-}
-
-/// Which equations were integrated. Chosen by the simulator, reported with every run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum SolverPath {
-    /// Redundant coordinates with multipliers: any machine.
-    #[default]
-    General,
-    /// Minimal coordinates of one boom that moves in its plane.
-    Planar,
-    /// Free coordinates of a tree of bodies with loops, all in one plane.
-    Tree,
-}
-
-impl SolverPath {
-    /// Name in data sets.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::General => "general",
-            Self::Planar => "planar",
-            Self::Tree => "planar_tree",
-        }
-    }
 }

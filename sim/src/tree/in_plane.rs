@@ -91,7 +91,7 @@ fn across(body: &ReducedBody, kept: &DMatrix<f64>, mode: usize) -> f64 {
 /// Largest coupling of a normal mode with motion and forces in the plane, relative to full coupling.
 fn coupling(body: &ReducedBody, moving: &DMatrix<f64>, mode: usize) -> f64 {
     let norm = body.mass_modal[(mode, mode)].sqrt();
-    let weight = body.c_pt[(0, mode)].hypot(body.c_pt[(1, mode)]) / (norm * body.mass_kg.sqrt());
+    let weight = libm::hypot(body.c_pt[(0, mode)], body.c_pt[(1, mode)]) / (norm * body.mass_kg.sqrt());
     let turn = body.c_xp[(2, mode)].abs() / (norm * body.inertia_origin_kg_m2[(2, 2)].sqrt());
     let with_boundary = (0..moving.ncols())
         .map(|j| {
@@ -108,7 +108,8 @@ fn coupling(body: &ReducedBody, moving: &DMatrix<f64>, mode: usize) -> f64 {
         .filter(|i| !body.report.boundary_names.contains(&i.name))
         .map(|i| {
             let size = |k: usize| {
-                i.translation[(0, k)].hypot(i.translation[(1, k)]) / body.stiffness_modal[(k, k)].sqrt()
+                libm::hypot(i.translation[(0, k)], i.translation[(1, k)])
+                    / body.stiffness_modal[(k, k)].sqrt()
             };
             let most = (0..body.mode_count()).map(size).fold(f64::MIN_POSITIVE, f64::max);
             size(mode) / most

@@ -204,7 +204,7 @@ impl TreeModel {
     fn positions(&self, m: &mut Motion) {
         for &body in &self.order {
             let angle = self.follow(body, &m.y, |b| m.frames[b].angle);
-            let (sin, cos) = angle.sin_cos();
+            let (sin, cos) = libm::sincos(angle);
             let frame = &mut m.frames[body];
             (frame.angle, frame.sin, frame.cos) = (angle, sin, cos);
             let b = &self.bodies[body];

@@ -1,6 +1,6 @@
 //! A run: pieces of the valve signals, error control, chambers at vapour pressure, records.
 
-use hydroflex_openapi::job::RunFlag;
+use hydroflex_openapi::job::{RunFlag, SolverPath};
 use hydroflex_openapi::machine::MachineFile;
 use nalgebra::Matrix3;
 
@@ -8,7 +8,7 @@ use super::model::TreeModel;
 use super::step::{Point, Signal, Stepper};
 use crate::system::{State, Workspace};
 use crate::trajectory::recorder::FlagSet;
-use crate::trajectory::{RunFailure, RunInput, SolverPath, SolverStatistics, Trajectory};
+use crate::trajectory::{RunFailure, RunInput, SolverStatistics, Trajectory};
 
 /// Default accuracy: every channel but accelerations within 1e-3 of its range.
 pub const TOLERANCE: f64 = 1e-3;

@@ -3,7 +3,7 @@
 use hydroflex_dataset::{PublishSpec, RunKind, RunOutcome, RunRecord, RunSamples, RunStatistics};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::dataset::{CodeFacts, MachineFacts};
-use hydroflex_openapi::job::{JobSpec, RunFlag};
+use hydroflex_openapi::job::{JobSpec, RunFlag, SolverPath};
 
 pub(crate) const STEPS: usize = 200;
 
@@ -112,6 +112,7 @@ pub(crate) fn record(kind: RunKind, run_id: u64, steps: usize) -> RunRecord {
         run_id,
         seed: Some(run_id ^ 0xabcd),
         payload_kg: 100.0 * unit(),
+        material: (run_id % 3 == 0).then(|| "aluminium".to_owned()),
         angles_rad: vec![unit()],
         outcome: RunOutcome::Ok(RunSamples {
             sample_count: steps + 1,
@@ -127,6 +128,7 @@ pub(crate) fn record(kind: RunKind, run_id: u64, steps: usize) -> RunRecord {
             rejected: run_id % 3,
             iterations: 0,
             factorisations: 240,
+            path: Some(SolverPath::Planar),
         },
     }
 }

@@ -1,7 +1,9 @@
 //! Jobs: accepted once, in order of urgency, done again where they failed.
 
 use crate::{new_dataset, new_job, result};
-use hydroflex_ledger::{CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, ShardResult};
+use hydroflex_ledger::{
+    CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, ShardResult,
+};
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::TrainingSpec;
@@ -181,8 +183,13 @@ async fn given_up_runs_are_done_again_and_nothing_else(ledger: Ledger) {
     };
     ledger.commit_shard(&claim, &done).await.unwrap();
     assert!(ledger.begin_publishing(id).await.unwrap());
+    // A publisher that slept since the first round knows nothing of the run that was done again.
+    let stale = new_dataset();
+    assert!(!ledger.publish_dataset(id, &stale, &[]).await.unwrap());
+    let round = ledger.job(id).await.unwrap().unwrap().round;
+    let whole = NewDataset { round, ..stale };
     ledger
-        .publish_dataset(id, &new_dataset(), &[TrainingSpec::default()])
+        .publish_dataset(id, &whole, &[TrainingSpec::default()])
         .await
         .unwrap();
     let trainings = ledger.trainings_of(id).await.unwrap();

@@ -115,6 +115,7 @@ fn new_job(run_shards: &[u64]) -> NewJob {
         machine_sha256: HASH.to_owned(),
         settling_shards: Vec::new(),
         run_shards: run_shards.to_vec(),
+        notices: Vec::new(),
     }
 }
 
@@ -135,6 +136,7 @@ fn result(object: &str) -> ShardResult {
 
 fn new_dataset() -> NewDataset {
     NewDataset {
+        round: 0,
         id: DatasetId::of_sha256(HASH).unwrap(),
         sha256: HASH.to_owned(),
         spec: spec(4, 0),

@@ -58,6 +58,7 @@ async fn what_nobody_publishes_is_deleted(ledger: &Ledger, blobs: &Blobs) {
     // A name of its own for each pair: the ledgers and the stores are shared by all.
     let unique = sha256(uuid_of(ledger, blobs).await.as_bytes());
     let dataset = NewDataset {
+        round: 0,
         id: DatasetId::of_sha256(&unique).unwrap(),
         sha256: unique,
         ..new_dataset()
