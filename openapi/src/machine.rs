@@ -136,9 +136,12 @@ pub struct FlexibleBodySpec {
     pub name: String,
     /// Where the mesh comes from.
     pub mesh: MeshSource,
-    /// Linear elastic isotropic material.
+    /// Mass and stiffness that Abaqus assembled for this mesh, in place of our own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub matrices: Option<MatricesSpec>,
+    /// Linear elastic isotropic material. Of a body with `matrices` it makes stress out of strain, and nothing else.
     pub material: MaterialSpec,
-    /// Lumped or consistent mass matrix.
+    /// Lumped or consistent mass matrix, where we assemble it.
     #[serde(default)]
     pub mass_matrix: MassMatrixKind,
     /// Fixed-interface normal modes kept beside the static ones.
@@ -161,6 +164,17 @@ pub enum MeshSource {
     /// Given on the command line: `--mesh FILE` or `--mesh BODY=FILE`. The text says which mesh is
     /// meant and where it comes from, for the error when none is given.
     Given(String),
+}
+
+/// Text files of Abaqus's `*MATRIX OUTPUT, STIFFNESS, MASS` in the format `MATRIX INPUT` or `COORDINATE`, relative to the machine
+/// file, in N/m and kg.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MatricesSpec {
+    /// Stiffness of the free body, such as `boom_STIF1.mtx`.
+    pub stiffness: String,
+    /// Mass, such as `boom_MASS1.mtx`.
+    pub mass: String,
 }
 
 /// Isotropic material.

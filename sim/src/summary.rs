@@ -1,6 +1,6 @@
 //! What there is to know about a machine before it moves: for `hydroflex machine show`.
 
-use crate::fe::{InterfaceNodes, assemble_mass, assemble_stiffness};
+use crate::fe::InterfaceNodes;
 use crate::linearise::Actuation;
 use crate::machine::FlexibleBody;
 use crate::reduction::{ClampedModel, ReducedBody, ReductionError, free_free_hz};
@@ -226,8 +226,8 @@ fn flexible_summary(
     body: &FlexibleBody,
 ) -> Result<BodySummary, SummaryError> {
     let without = &simulator.reduced(false)?[index];
-    let stiffness = assemble_stiffness(&body.mesh, &body.material);
-    let mass = assemble_mass(&body.mesh, &body.material, body.mass_kind);
+    let model = body.model(false);
+    let (stiffness, mass) = (model.stiffness(), model.mass());
     let mut is_fixed = vec![false; body.mesh.node_count()];
     for node in &body.interfaces[0].nodes {
         is_fixed[*node as usize] = true;

@@ -171,6 +171,7 @@ fn cloud_file() -> MachineFile {
         BodySpec::Flexible(FlexibleBodySpec {
             name: name.to_owned(),
             mesh: MeshSource::Given(String::new()),
+            matrices: None,
             material: MaterialSpec {
                 name: "none".to_owned(),
                 youngs_modulus_pa: 1.0,

@@ -195,6 +195,7 @@ fn model<'a>(
     FlexibleModel {
         name: "boom",
         mesh: &r.mesh,
+        matrices: None,
         material: STEEL,
         mass_kind: MassKind::Lumped,
         normal_modes: 2,

@@ -25,7 +25,7 @@ pub(crate) struct NodePattern {
 }
 
 impl NodePattern {
-    fn of(mesh: &Mesh) -> Self {
+    pub(super) fn of(mesh: &Mesh) -> Self {
         let (offsets, attached) = mesh.attached_elements();
         let mut row_start = Vec::with_capacity(mesh.node_count() + 1);
         row_start.push(0);
@@ -44,7 +44,29 @@ impl NodePattern {
         Self { row_start, columns }
     }
 
-    fn position(&self, row: u32, column: u32) -> usize {
+    /// The same with these pairs, too.
+    pub(super) fn with(&self, pairs: impl Iterator<Item = (u32, u32)>) -> Self {
+        let nodes = self.row_start.len() - 1;
+        let own = (0_u32..)
+            .zip(self.row_start.windows(2))
+            .flat_map(|(row, ends)| self.columns[ends[0]..ends[1]].iter().map(move |c| (row, *c)));
+        let mut all: Vec<(u32, u32)> = own.chain(pairs).collect();
+        all.sort_unstable();
+        all.dedup();
+        let mut row_start = vec![0; nodes + 1];
+        for (row, _) in &all {
+            row_start[*row as usize + 1] += 1;
+        }
+        for row in 0..nodes {
+            row_start[row + 1] += row_start[row];
+        }
+        Self {
+            row_start,
+            columns: all.into_iter().map(|(_, column)| column).collect(),
+        }
+    }
+
+    pub(super) fn position(&self, row: u32, column: u32) -> usize {
         let start = self.row_start[row as usize];
         let columns = &self.columns[start..self.row_start[row as usize + 1]];
         start

@@ -1,6 +1,6 @@
 //! Why a machine is refused.
 
-use crate::fe::MeshError;
+use crate::fe::{MatrixError, MeshError};
 use std::path::PathBuf;
 
 /// A machine that cannot be used.
@@ -253,6 +253,20 @@ pub enum Problem {
         /// The operating system's words.
         reason: String,
     },
+    /// Matrices in text that came from outside.
+    #[error("a machine that is sent as text can name no files of matrices; simulate it from its file")]
+    MatricesNotAllowed,
+    /// A matrix that cannot be read.
+    #[error("cannot read the matrix {path}: {reason}")]
+    MatrixUnreadable {
+        /// Path.
+        path: String,
+        /// The operating system's words.
+        reason: String,
+    },
+    /// Matrices that cannot be used.
+    #[error("{0}")]
+    Matrices(#[from] MatrixError),
     /// A mesh that cannot be used.
     #[error("mesh {mesh}: {error}")]
     Mesh {

@@ -1,8 +1,9 @@
 //! A flexible body of a checked machine: mesh, interfaces, sensors, and how it is reduced.
 
-use crate::fe::{InterfaceNodes, MassKind, Material, Mesh};
+use crate::fe::{GivenMatrices, InterfaceNodes, MassKind, Material, Mesh};
 use crate::reduction::{Damping, FlexibleModel, ReducedBody, ReductionError, reduce};
 use sha2::{Digest, Sha256};
+use std::sync::Arc;
 
 /// Raised whenever the same input gives other numbers: part of every content hash, so that no
 /// stale reduction is ever read.
@@ -19,6 +20,8 @@ pub struct FlexibleBody {
     pub mesh: Mesh,
     /// SHA-256 of the mesh file.
     pub mesh_sha256: [u8; 32],
+    /// Mass and stiffness that came with the mesh, with the SHA-256 of their files.
+    pub matrices: Option<(Arc<GivenMatrices>, [u8; 32])>,
     /// Material.
     pub material: Material,
     /// Kind of mass matrix.
@@ -44,6 +47,7 @@ impl FlexibleBody {
         FlexibleModel {
             name: &self.name,
             mesh: &self.mesh,
+            matrices: self.matrices.as_ref().map(|(given, _)| given.as_ref()),
             material: self.material,
             mass_kind: self.mass_kind,
             normal_modes: self.normal_modes,
@@ -74,6 +78,10 @@ impl FlexibleBody {
         hash.update(b"hydroflex reduced body\0");
         hash.update(REDUCTION_VERSION.to_le_bytes());
         hash.update(self.mesh_sha256);
+        if let Some((_, sha256)) = &self.matrices {
+            hash.update(b"matrices\0");
+            hash.update(sha256);
+        }
         // Debug prints every bit of a float that matters (shortest text that reads back the same)
         hash.update(format!(
             "{:?}",

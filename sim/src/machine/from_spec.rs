@@ -92,6 +92,7 @@ pub(super) fn flexible_body(
     Ok(FlexibleBody {
         name: spec.name.clone(),
         body_index: index,
+        matrices: None,
         material: Material::from(&spec.material),
         mass_kind: spec.mass_matrix.into(),
         normal_modes: spec.normal_modes,

@@ -15,13 +15,14 @@ pub(crate) use check::material_numbers;
 pub use error::{MachineError, MeshArgumentProblem, Place, Problem};
 pub use flexible::{FlexibleBody, REDUCTION_VERSION};
 
-use crate::fe::read_abaqus;
+use crate::fe::{GivenMatrices, Mesh, read_abaqus, read_matrices};
 use crate::reduction::{ReducedBody, ReductionError, cached};
-use hydroflex_openapi::machine::{BodySpec, MachineFile, MaterialSpec, MeshSource};
+use hydroflex_openapi::machine::{BodySpec, MachineFile, MaterialSpec, MatricesSpec, MeshSource};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use text::MachineText;
 
 /// A checked machine.
@@ -158,7 +159,12 @@ impl Machine {
                 })
             })?;
             let sha256 = Sha256::digest(mesh_text.as_bytes()).into();
-            flexible.push(from_spec::flexible_body(&located, &file, index, mesh, sha256)?);
+            let mut body_model = from_spec::flexible_body(&located, &file, index, mesh, sha256)?;
+            if let Some(given) = &spec.matrices {
+                let refuse = |problem| located.refuse(format!("body[{index}].matrices"), problem);
+                body_model.matrices = Some(matrices(given, &body_model.mesh, access).map_err(refuse)?);
+            }
+            flexible.push(body_model);
         }
         let machine = Self {
             file,
@@ -213,6 +219,9 @@ impl Machine {
         hash.update(self.text.as_bytes());
         for body in &self.flexible {
             hash.update(body.mesh_sha256);
+            if let Some((_, sha256)) = &body.matrices {
+                hash.update(sha256);
+            }
         }
         hash.finalize().into()
     }
@@ -367,6 +376,32 @@ fn mesh_text(
             what: what.clone(),
         }),
     }
+}
+
+/// Mass and stiffness of a body from files beside the machine file, with the hash of both.
+fn matrices(
+    spec: &MatricesSpec,
+    mesh: &Mesh,
+    access: &MeshAccess<'_>,
+) -> Result<(Arc<GivenMatrices>, [u8; 32]), Problem> {
+    let MeshAccess::Local { folder, .. } = access else {
+        return Err(Problem::MatricesNotAllowed);
+    };
+    let read = |name: &str| {
+        let path = folder.join(name);
+        std::fs::read_to_string(&path).map_err(|error| Problem::MatrixUnreadable {
+            path: path.display().to_string(),
+            reason: error.to_string(),
+        })
+    };
+    let (stiffness, mass) = (read(&spec.stiffness)?, read(&spec.mass)?);
+    let given = read_matrices(mesh, &stiffness, &mass)?;
+    let mut hash = Sha256::new();
+    for text in [stiffness, mass] {
+        hash.update((text.len() as u64).to_le_bytes());
+        hash.update(text.as_bytes());
+    }
+    Ok((Arc::new(given), hash.finalize().into()))
 }
 
 #[cfg(test)]

@@ -5,10 +5,11 @@ use super::factor::StiffnessFactor;
 use super::inertia_integrals::integrate;
 use super::{Damping, ReducedBody, ReducedInterface, ReducedNode, ReductionError, ReductionReport};
 use crate::fe::{
-    BlockMatrix, InterfaceNodes, MassKind, Material, Mesh, NodalMass, assemble_mass, assemble_stiffness,
-    nodal_strain_map, stress_from_strain,
+    BlockMatrix, GivenMatrices, InterfaceNodes, MassKind, Material, Mesh, NodalMass, assemble_mass,
+    assemble_stiffness, nodal_strain_map, stress_from_strain,
 };
 use nalgebra::{DMatrix, Matrix3, Matrix3xX, Vector3};
+use std::borrow::Cow;
 
 /// A finite-element body and what is to be kept of it.
 #[derive(Debug, Clone)]
@@ -17,6 +18,8 @@ pub struct FlexibleModel<'a> {
     pub name: &'a str,
     /// Checked mesh.
     pub mesh: &'a Mesh,
+    /// Mass and stiffness that came with the mesh; absent where we assemble them.
+    pub matrices: Option<&'a GivenMatrices>,
     /// Material.
     pub material: Material,
     /// Kind of mass matrix.
@@ -49,8 +52,7 @@ pub struct ModeBasis {
 /// # Errors
 /// [`ReductionError`] when the structure is not held by its interfaces, or modes cannot be found.
 pub fn reduce(model: &FlexibleModel<'_>) -> Result<ReducedBody, ReductionError> {
-    let stiffness = assemble_stiffness(model.mesh, &model.material);
-    let mass = assemble_mass(model.mesh, &model.material, model.mass_kind);
+    let (stiffness, mass) = (model.stiffness(), model.mass());
     let basis = mode_basis(model, &stiffness, &mass)?;
     Ok(project(model, &stiffness, &mass, basis))
 }
@@ -189,7 +191,25 @@ fn hertz(omega_squared: f64) -> f64 {
     omega_squared.max(0.0).sqrt() / (2.0 * std::f64::consts::PI)
 }
 
-impl FlexibleModel<'_> {
+impl<'a> FlexibleModel<'a> {
+    /// Stiffness of the free body, N/m.
+    #[must_use]
+    pub fn stiffness(&self) -> Cow<'a, BlockMatrix> {
+        match self.matrices {
+            Some(given) => Cow::Borrowed(&given.stiffness),
+            None => Cow::Owned(assemble_stiffness(self.mesh, &self.material)),
+        }
+    }
+
+    /// Its mass, kg.
+    #[must_use]
+    pub fn mass(&self) -> Cow<'a, NodalMass> {
+        match self.matrices {
+            Some(given) => Cow::Borrowed(&given.mass),
+            None => Cow::Owned(assemble_mass(self.mesh, &self.material, self.mass_kind)),
+        }
+    }
+
     fn boundary_interfaces(&self) -> Result<Vec<&InterfaceNodes>, ReductionError> {
         if self.boundary.is_empty() {
             return Err(ReductionError::NoBoundary);

@@ -171,6 +171,21 @@ fn materials(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
         listed.len(),
         format!("none: machine {} has no flexible body", machine.name),
     );
+    let with_matrices = machine.bodies.iter().find_map(|body| match body {
+        BodySpec::Flexible(body) if body.matrices.is_some() => Some(&body.name),
+        _ => None,
+    });
+    if let Some(body) = with_matrices {
+        errors.require(
+            listed.is_empty(),
+            "/materials",
+            listed.len(),
+            format!(
+                "none: body {body} of machine {} has matrices of its own",
+                machine.name
+            ),
+        );
+    }
     for (k, material) in listed.iter().enumerate() {
         let pointer = format!("/materials/{k}");
         let name = material.name();
