@@ -575,10 +575,7 @@ impl Study<'_> {
             window: WindowRule::Given {
                 window_s: steps as f64 * SAMPLE_S,
             },
-            follow: match payload {
-                Payload::Range { .. } if structure == "best" => self.args.mixed_follow.clone(),
-                _ => Vec::new(),
-            },
+            follow: followed(self.args, *payload, structure),
             seed,
             // The published length belongs to the published way.
             epochs: self.args.epochs.filter(|_| recipe == Recipe::Ours),
@@ -587,13 +584,7 @@ impl Study<'_> {
             windows: recipe.windows(),
             ..TrainingSpec::default()
         };
-        let noisy = if noise == NoiseChoice::Crane { "-crane" } else { "" };
-        let published = if recipe == Recipe::Published {
-            "-published"
-        } else {
-            ""
-        };
-        let name = format!("{}-{structure}{published}{noisy}-{seed}", sensors.name());
+        let name = cell_name(sensors, structure, recipe, noise, seed);
         let path = folder.join(format!("{name}.json"));
         let evaluated = self.evaluated();
         if Structure::is_comparison(structure) {
@@ -634,10 +625,9 @@ impl Study<'_> {
                 .with_context(|| format!("cannot evaluate {name} at {payload_kg} kg"))?;
             let sha256 = evaluation.dataset_sha256();
             let report = |runs: &Runs| anyhow::Ok(evaluate(&model, runs, sha256)?.report);
-            let random = evaluate(&model, &runs.random, sha256)?;
             let picture = folder.join(format!("{name}-at-{payload_kg}-kg.svg"));
-            let svg = profile::of_target(&model, &random, 0, &format!("{name} at {payload_kg} kg"));
-            std::fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
+            let title = format!("{name} at {payload_kg} kg");
+            let random = evaluate_and_draw(&model, &runs.random, sha256, &picture, &title)?;
             let cell = Cell {
                 payload_kg,
                 signals: self.args.signals,
@@ -652,7 +642,7 @@ impl Study<'_> {
                 parameters: summary.parameters,
                 train_seconds: summary.train_seconds,
                 cycle: report(&runs.cycle)?,
-                random: random.report,
+                random,
                 calm: report(&runs.calm)?,
                 flagged: (!runs.flagged.runs.is_empty())
                     .then(|| report(&runs.flagged))
@@ -835,6 +825,39 @@ fn evaluation_parts(
         "--signals is {signals}, but only {found} of {of} random runs stay within stroke and pressures"
     );
     Ok(parts)
+}
+
+/// Name of a network's files.
+fn cell_name(sensors: SensorSet, structure: &str, recipe: Recipe, noise: NoiseChoice, seed: u64) -> String {
+    let noisy = if noise == NoiseChoice::Crane { "-crane" } else { "" };
+    let published = if recipe == Recipe::Published {
+        "-published"
+    } else {
+        ""
+    };
+    format!("{}-{structure}{published}{noisy}-{seed}", sensors.name())
+}
+
+/// Errors on `runs`, and a picture of where they stand.
+fn evaluate_and_draw(
+    model: &Model,
+    runs: &Runs,
+    dataset_sha256: &str,
+    picture: &Path,
+    title: &str,
+) -> anyhow::Result<EvaluationReport> {
+    let evaluation = evaluate(model, runs, dataset_sha256)?;
+    std::fs::write(picture, profile::of_target(model, &evaluation, 0, title))
+        .with_context(|| format!("cannot write {}", picture.display()))?;
+    Ok(evaluation.report)
+}
+
+/// What the linear map of a network for `payload` follows: the default for a payload that is known.
+fn followed(args: &Args, payload: Payload, structure: &str) -> Vec<String> {
+    match payload {
+        Payload::Range { .. } if structure == "best" => args.mixed_follow.clone(),
+        _ => Vec::new(),
+    }
 }
 
 /// As [`finished`], for networks for comparison.

@@ -4,6 +4,7 @@ use super::job::ServiceArgs;
 use crate::client::{Client, bar};
 use anyhow::Context;
 use hydroflex_openapi::sweep::{SweepPage, SweepState, SweepStatus};
+use std::fmt::Write as _;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,8 +15,7 @@ const POLL: Duration = Duration::from_millis(500);
 /// Subcommands of `hydroflex sweep`.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
-    /// Submit a sweep from a JSON file (`-` for standard input), such as
-    /// {"dataset_id": "…", "structures": ["best", "RLR"], "sensors": ["all", "us"], "seeds": [0, 1]}
+    /// Submit a sweep from a JSON file (`-` for standard input)
     Submit {
         /// Sweep as JSON
         file: PathBuf,
@@ -201,7 +201,8 @@ fn trained(status: &SweepStatus) -> String {
         (progress.cancelled, "cancelled"),
     ] {
         if count > 0 {
-            text.push_str(&format!(", {count} {what}"));
+            // Writing to a String cannot fail.
+            let _ = write!(text, ", {count} {what}");
         }
     }
     text
