@@ -82,6 +82,40 @@ fn columns_sample_type_and_file_size_are_choices() {
     service.terminate().unwrap();
 }
 
+/// A window from the machine's eigenvalues needs no settling run: the data set says how long it is.
+#[test]
+fn a_network_takes_its_window_from_eigenvalues() {
+    let folder = tempfile::tempdir().unwrap();
+    let start = Start {
+        workers: 1,
+        ..Start::default()
+    };
+    let service = ServiceUnderTest::start(folder.path(), &start).unwrap();
+    let job = serde_json::json!({
+        "runs": 40, "settling_runs": 0, "payload_kg": 50, "duration_s": 2.0,
+        "train": [{ "structure": "L", "window": { "rule": "eigenvalues" }, "targets": ["deflection_tip_y_m"], "epochs": 2 }],
+    });
+    let id = service.submit(&job).unwrap().job_id.to_string();
+    let status = service.wait_for(&id, |status| status.state.is_final()).unwrap();
+    assert_eq!(status.state, JobState::Succeeded, "{status:?}");
+    let json =
+        |path: String| -> serde_json::Value { serde_json::from_slice(&service.get(&path).unwrap()).unwrap() };
+    let dataset = status.dataset_id.unwrap();
+    let facts = json(format!("/v1/datasets/{dataset}/files/meta/window.json"));
+    let window_s = facts["eigenvalues_s"].as_f64().unwrap();
+    assert!((0.05..1.0).contains(&window_s), "{facts}");
+    let models = json("/v1/models".to_owned());
+    let model = models["models"][0]["model_id"].as_str().unwrap();
+    let steps = json(format!("/v2/models/{model}"))["inputs"][0]["shape"][1]
+        .as_f64()
+        .unwrap();
+    assert!(
+        (steps * 0.005 - window_s).abs() <= 0.005,
+        "{steps} steps for {window_s} s"
+    );
+    service.terminate().unwrap();
+}
+
 /// Training files of a job's data set, in order.
 fn publish(service: &ServiceUnderTest, job: &serde_json::Value) -> Vec<Vec<u8>> {
     let id = service.submit(job).unwrap().job_id.to_string();

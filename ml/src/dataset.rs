@@ -151,7 +151,8 @@ fn window_s(dataset: &Dataset, rule: WindowRule) -> Result<f64, TrainError> {
     let length = match rule {
         WindowRule::Band => facts.band_s,
         WindowRule::Paper => facts.paper_s,
-        WindowRule::Eigenvalues | WindowRule::Given { .. } => None,
+        WindowRule::Eigenvalues => facts.eigenvalues_s,
+        WindowRule::Given { .. } => None,
     };
     length.filter(|s| *s > 0.0).ok_or(TrainError::NoWindow)
 }

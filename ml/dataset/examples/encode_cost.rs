@@ -72,6 +72,7 @@ fn main() -> Result<(), Failure> {
             channels: dataset.channels().to_vec(),
             sample_time_s: dataset.sample_time_s(),
             sample_type,
+            eigenvalue_window_s: None,
             split: Split::default(),
             file_size_mb: hydroflex_dataset::cut::FILE_SIZE_MB,
             lengths: RunLengths::Listed(loaded.iter().map(|r| r.sample_count as u64).collect()),

@@ -54,6 +54,8 @@ pub struct PublishSpec {
     pub file_size_mb: u32,
     /// Planned lengths of the runs, failed or not.
     pub lengths: RunLengths,
+    /// Window from the eigenvalues of the machine, s, where they are known.
+    pub eigenvalue_window_s: Option<f64>,
 }
 
 /// Planned rows of each run, in the order of run indices.
@@ -112,6 +114,7 @@ impl PublishSpec {
                 rows: spec.steps() as u64 + 1,
             },
             source: DatasetSource::Job { spec: Box::new(spec) },
+            eigenvalue_window_s: None,
         }
     }
 
@@ -448,7 +451,10 @@ impl<S: Sink> Publisher<S> {
             self.flush_settling()?;
         }
         let statistics = self.statistics();
-        let window = self.settling.windows.finish();
+        let window = WindowFacts {
+            eigenvalues_s: self.spec.eigenvalue_window_s,
+            ..self.settling.windows.finish()
+        };
         let Self {
             spec,
             mut output,
@@ -466,6 +472,8 @@ impl<S: Sink> Publisher<S> {
         output.files.push(runs_table.finish()?);
         if let Some(writer) = settling.writer {
             output.close_samples(writer, settling.rows)?;
+        }
+        if counts.settling > 0 || window.eigenvalues_s.is_some() {
             output.write_json("meta/window.json", &window)?;
         }
         output.write_json("meta/stats.json", &statistics)?;

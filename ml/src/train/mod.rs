@@ -121,7 +121,7 @@ pub enum TrainError {
     },
     /// The data set does not say how long a window is.
     #[error(
-        "the data set does not tell the window length by this rule (no settling runs, or none that settles); give the window in seconds"
+        "the data set does not tell the window length by this rule (no settling runs, none that settles, or a table of runs, whose eigenvalues nobody computed); give the window in seconds"
     )]
     NoWindow,
     /// The data set cannot be read.

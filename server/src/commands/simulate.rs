@@ -198,6 +198,7 @@ fn publish_spec(
         split: Split::default(),
         file_size_mb: hydroflex_dataset::cut::FILE_SIZE_MB,
         lengths: RunLengths::Listed(runs.iter().map(rows).collect()),
+        eigenvalue_window_s: None,
     })
 }
 

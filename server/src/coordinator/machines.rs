@@ -166,7 +166,11 @@ impl CheckedMachine {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             instruction_set: instruction_set.to_owned(),
         };
-        PublishSpec::of_job(spec, machine, code, self.0.simulator.channels().to_vec())
+        let eigenvalue_window_s = super::notices::eigenvalue_window_of_job_s(&self.0, &spec);
+        PublishSpec {
+            eigenvalue_window_s,
+            ..PublishSpec::of_job(spec, machine, code, self.0.simulator.channels().to_vec())
+        }
     }
 }
 

@@ -32,9 +32,7 @@ pub fn of(machine: &ReadyMachine, spec: &JobSpec) -> Vec<JobNotice> {
 }
 
 fn window(machine: &ReadyMachine, spec: &JobSpec) -> Option<JobNotice> {
-    let payload_kg = match spec.payload_kg {
-        ValueOrRange::Value(kg) | ValueOrRange::Range { max: kg, .. } => kg,
-    };
+    let payload_kg = largest_payload_kg(spec);
     let mut rules: Vec<WindowRule> = spec.train.iter().map(|training| training.window).collect();
     if rules.is_empty() {
         rules.push(WindowRule::default());
@@ -89,6 +87,20 @@ fn length(
                 .map(|s| (s, how))
                 .or_else(by_eigenvalues)
         }
+    }
+}
+
+/// SLIDE's window from the eigenvalues of the slowest machine of a job, s, to the microsecond: their last digits differ
+/// between instruction sets. None where a motion does not decay.
+#[must_use]
+pub(super) fn eigenvalue_window_of_job_s(machine: &ReadyMachine, spec: &JobSpec) -> Option<f64> {
+    let window_s = eigenvalue_window_s(machine.simulator_of(softest(spec)), largest_payload_kg(spec))?;
+    Some((window_s * 1e6).round() / 1e6)
+}
+
+fn largest_payload_kg(spec: &JobSpec) -> f64 {
+    match spec.payload_kg {
+        ValueOrRange::Value(kg) | ValueOrRange::Range { max: kg, .. } => kg,
     }
 }
 
