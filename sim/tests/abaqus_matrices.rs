@@ -226,7 +226,7 @@ fn a_matrix_that_cannot_be_is_refused() {
     let refused = |k: &str, m: &str| read_matrices(&mesh, k, m).unwrap_err();
     let problem = |k: &str| match refused(k, &m) {
         MatrixError::Line { problem, line, .. } => (line, problem),
-        other => panic!("{other}"),
+        other @ MatrixError::Whole { .. } => panic!("{other}"),
     };
     assert_eq!(problem("1,4,1,1,1.0"), (1, MatrixProblem::Dof { dof: 4 }));
     assert_eq!(
@@ -252,7 +252,7 @@ fn a_matrix_that_cannot_be_is_refused() {
 
     let whole = |k: &str, m: &str| match refused(k, m) {
         MatrixError::Whole { defect, .. } => defect,
-        other => panic!("{other}"),
+        other @ MatrixError::Line { .. } => panic!("{other}"),
     };
     assert!(matches!(
         whole("1,1,1,1,1.0", &m),

@@ -378,7 +378,46 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
         );
     }
     window(spec, training, &at("window"), errors);
-    let positive = |x: Option<f64>| x.is_none_or(|x| x > 0.0 && x.is_finite());
+    shape(training, &at, errors);
+    errors.require(
+        training.epochs.is_none_or(|epochs| epochs >= 1),
+        at("epochs"),
+        training.epochs,
+        "at least 1",
+    );
+    errors.require(
+        training.time_limit_s.is_none_or(|s| s > 0.0 && s.is_finite()),
+        at("time_limit_s"),
+        training.time_limit_s,
+        "above 0 s",
+    );
+    errors.require(
+        training
+            .learning_rate
+            .is_none_or(|rate| rate > 0.0 && rate <= 1.0),
+        at("learning_rate"),
+        training.learning_rate,
+        "above 0, at most 1",
+    );
+    errors.require(
+        training.batch.is_none_or(|batch| batch >= 1),
+        at("batch"),
+        training.batch,
+        "at least 1",
+    );
+    let trains = (0..spec.runs.min(1000))
+        .any(|run| spec.split.of(run) == hydroflex_openapi::dataset::SplitName::Train);
+    errors.require(
+        trains,
+        "/split/train",
+        spec.split.train,
+        "enough for one training run, where networks are to be trained",
+    );
+}
+
+/// Width, outputs and dropout of a network.
+fn shape(training: &TrainingSpec, at: &impl Fn(&str) -> String, errors: &mut Errors) {
+    let structure = training.structure.as_str();
     errors.require(
         training.width.is_none_or(|width| (1..=4096).contains(&width)),
         at("width"),
@@ -408,40 +447,6 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
         at("dropout"),
         training.dropout,
         "at least 0, below 1, for structures with the letter D",
-    );
-    errors.require(
-        training.epochs.is_none_or(|epochs| epochs >= 1),
-        at("epochs"),
-        training.epochs,
-        "at least 1",
-    );
-    errors.require(
-        positive(training.time_limit_s),
-        at("time_limit_s"),
-        training.time_limit_s,
-        "above 0 s",
-    );
-    errors.require(
-        training
-            .learning_rate
-            .is_none_or(|rate| rate > 0.0 && rate <= 1.0),
-        at("learning_rate"),
-        training.learning_rate,
-        "above 0, at most 1",
-    );
-    errors.require(
-        training.batch.is_none_or(|batch| batch >= 1),
-        at("batch"),
-        training.batch,
-        "at least 1",
-    );
-    let trains = (0..spec.runs.min(1000))
-        .any(|run| spec.split.of(run) == hydroflex_openapi::dataset::SplitName::Train);
-    errors.require(
-        trains,
-        "/split/train",
-        spec.split.train,
-        "enough for one training run, where networks are to be trained",
     );
 }
 

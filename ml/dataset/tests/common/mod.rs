@@ -112,7 +112,7 @@ pub(crate) fn record(kind: RunKind, run_id: u64, steps: usize) -> RunRecord {
         run_id,
         seed: Some(run_id ^ 0xabcd),
         payload_kg: 100.0 * unit(),
-        material: (run_id % 3 == 0).then(|| "aluminium".to_owned()),
+        material: run_id.is_multiple_of(3).then(|| "aluminium".to_owned()),
         angles_rad: vec![unit()],
         outcome: RunOutcome::Ok(RunSamples {
             sample_count: steps + 1,
