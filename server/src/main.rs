@@ -3,11 +3,6 @@
 use clap::{Parser, Subcommand};
 use hydroflex_server::commands;
 
-/// Requests, runs and shards allocate and free from many threads; see docs/benchmark-serving.md for what
-/// this one is worth.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 /// Real-time structural estimation for hydraulically driven flexible booms: simulate, store, train, predict.
 #[derive(Parser)]
 #[command(name = "hydroflex", version, about, propagate_version = true)]

@@ -104,7 +104,7 @@ def check_readers(out, rows):
         print(f"  {name}: {len(table)} rows, {len(table.columns)} columns")
     runs = pandas.read_parquet(out / "meta/runs.parquet")
     assert list(runs.run_id) == [10 * run for run in range(RUNS)]
-    assert set(runs.solver_path) == {"planar"}
+    assert set(runs.solver_path) == {"trapezoidal-index-2"}
     assert set(runs.status) == {"ok"} and runs.reason.isna().all() and all(len(flags) <= 5 for flags in runs["flags"])
     counts = reference.groupby("run_id").size()
     assert counts[30] == SHORT_STEPS + 1 and counts[0] == STEPS + 1
