@@ -430,10 +430,6 @@ pub struct TrainingSpec {
     /// Part of a layer's values that dropout (letter D) leaves out in training; default: 0.1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dropout: Option<f64>,
-    /// Inputs that the coefficients of our network's linear map follow, by their values at the end of the window; default:
-    /// the lengths of the cylinders, else the angles.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub follow: Vec<String>,
     /// Seed of initial weights and batches.
     #[serde(default)]
     pub seed: u64,
@@ -492,7 +488,6 @@ impl Default for TrainingSpec {
             width: None,
             width_windows: None,
             dropout: None,
-            follow: Vec::new(),
             seed: 0,
             epochs: None,
             time_limit_s: None,

@@ -302,7 +302,7 @@ impl Problem {
                 sample(&train, &every),
                 sample(&validation, &validation.windows),
                 &input_scaling,
-                &slow_inputs(&train_inputs, &spec.follow)?,
+                &slow_inputs(&train_inputs),
                 noise_covariance.as_ref(),
             )?)
         } else {
@@ -493,11 +493,8 @@ fn sample<'a>(part: &'a Part, windows: &'a Windows) -> Sample<'a> {
     }
 }
 
-/// Inputs that are named, or that tell the pose: lengths of cylinders, else angles.
-fn slow_inputs(inputs: &Runs, follow: &[String]) -> Result<Vec<usize>, TrainError> {
-    if !follow.is_empty() {
-        return Ok(inputs.positions(follow)?);
-    }
+/// Inputs that tell the pose: lengths of cylinders, else angles.
+fn slow_inputs(inputs: &Runs) -> Vec<usize> {
     let named = |prefix: &str| -> Vec<usize> {
         inputs
             .channels
@@ -508,11 +505,11 @@ fn slow_inputs(inputs: &Runs, follow: &[String]) -> Result<Vec<usize>, TrainErro
             .collect()
     };
     let lengths = named("length_");
-    Ok(if lengths.is_empty() {
+    if lengths.is_empty() {
         named("angle_")
     } else {
         lengths
-    })
+    }
 }
 
 /// The training range of each input, widened as the slow signals' is.

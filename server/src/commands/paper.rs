@@ -107,9 +107,6 @@ pub struct Args {
     /// Part of these runs that carry exactly nothing, where the machine has other modes than with the smallest payload
     #[arg(long, default_value_t = 0.0, requires = "mixed")]
     pub mixed_empty: f64,
-    /// Inputs that the coefficients of the linear map of these networks follow, separated by commas (default: lengths)
-    #[arg(long, value_delimiter = ',', requires = "mixed")]
-    pub mixed_follow: Vec<String>,
     /// Largest number of epochs of a training
     #[arg(long)]
     pub epochs: Option<usize>,
@@ -575,7 +572,6 @@ impl Study<'_> {
             window: WindowRule::Given {
                 window_s: steps as f64 * SAMPLE_S,
             },
-            follow: followed(self.args, *payload, structure),
             seed,
             // The published length belongs to the published way.
             epochs: self.args.epochs.filter(|_| recipe == Recipe::Ours),
@@ -850,14 +846,6 @@ fn evaluate_and_draw(
     std::fs::write(picture, profile::of_target(model, &evaluation, 0, title))
         .with_context(|| format!("cannot write {}", picture.display()))?;
     Ok(evaluation.report)
-}
-
-/// What the linear map of a network for `payload` follows: the default for a payload that is known.
-fn followed(args: &Args, payload: Payload, structure: &str) -> Vec<String> {
-    match payload {
-        Payload::Range { .. } if structure == "best" => args.mixed_follow.clone(),
-        _ => Vec::new(),
-    }
 }
 
 /// As [`finished`], for networks for comparison.

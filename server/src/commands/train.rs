@@ -33,9 +33,6 @@ pub struct Args {
     /// Target channels, separated by commas
     #[arg(long, value_delimiter = ',')]
     pub targets: Vec<String>,
-    /// Inputs that the coefficients of `best`'s linear map follow, separated by commas (default: the cylinders' lengths)
-    #[arg(long, value_delimiter = ',')]
-    pub follow: Vec<String>,
     /// Window length in seconds (default: from the data set)
     #[arg(long)]
     pub window_s: Option<f64>,
@@ -96,7 +93,6 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         window: args
             .window_s
             .map_or_else(WindowRule::default, |window_s| WindowRule::Given { window_s }),
-        follow: args.follow,
         seed: args.seed,
         output_steps: args.output_steps,
         width: match args.width {

@@ -367,16 +367,6 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
             );
         }
     }
-    for (k, name) in training.follow.iter().enumerate() {
-        let pointer = format!("{}/{k}", at("follow"));
-        known_once(&training.follow, k, &pointer, channels, errors);
-        errors.require(
-            structure == "best" && (training.inputs.is_empty() || training.inputs.contains(name)),
-            &pointer,
-            name,
-            "one of the inputs, for structure best",
-        );
-    }
     window(spec, training, &at("window"), errors);
     shape(training, &at, errors);
     errors.require(
