@@ -1,5 +1,6 @@
 //! A sweep: one request for structures × sensors × windows × seeds on a published data set.
 
+use crate::channel::Channel;
 use crate::id::{DatasetId, ModelId, SweepId, TrainingId};
 use crate::job::{TrainingSpec, WindowRule};
 use crate::model::TargetMetrics;
@@ -93,6 +94,18 @@ impl SensorSet {
     /// Every set.
     pub const ALL: [Self; 5] = [Self::All, Self::Usp, Self::Usdp2, Self::Usd, Self::Us];
 
+    /// Its name in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::All => "all",
+            Self::Usp => "usp",
+            Self::Usdp2 => "usdp2",
+            Self::Usd => "usd",
+            Self::Us => "us",
+        }
+    }
+
     /// How the paper writes it.
     #[must_use]
     pub fn label(self) -> &'static str {
@@ -103,6 +116,13 @@ impl SensorSet {
             Self::Usd => "U s ds",
             Self::Us => "U s",
         }
+    }
+
+    /// Names of those channels that belong to it, in their order.
+    #[must_use]
+    pub fn of(self, channels: &[Channel]) -> Vec<String> {
+        let names = channels.iter().map(|channel| channel.name.clone());
+        names.filter(|name| self.has(name)).collect()
     }
 
     /// Whether a channel of this name belongs to it.
@@ -281,6 +301,13 @@ pub struct CellResult {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sets_are_called_as_in_json() {
+        for set in SensorSet::ALL {
+            assert_eq!(serde_json::to_value(set).unwrap(), set.name());
+        }
+    }
 
     #[test]
     fn the_paper_s_sets_choose_channels_by_family() {

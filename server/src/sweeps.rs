@@ -80,11 +80,7 @@ impl Sweep {
         let mut chosen = Vec::new();
         for (k, sensors) in sensors.into_iter().enumerate() {
             let inputs: Vec<String> = match &sensors {
-                Sensors::Set(set) => channels
-                    .iter()
-                    .map(|channel| channel.name.clone())
-                    .filter(|name| set.has(name))
-                    .collect(),
+                Sensors::Set(set) => set.of(channels),
                 Sensors::Channels(names) => names.clone(),
             };
             if inputs.is_empty() {

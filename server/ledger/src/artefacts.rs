@@ -222,12 +222,7 @@ impl Ledger {
     ) -> Result<Created<TrainingId>, LedgerError> {
         let mut tx = self.pool.begin().await?;
         let id = insert_training(&mut tx, None, None, dataset, spec).await?;
-        if let Some(key) = key
-            && let Some(before) = claim_key(&mut tx, key, &id.to_string()).await?
-        {
-            let before = before
-                .parse()
-                .map_err(|_| LedgerError::corrupt("resource", &before))?;
+        if let Some(before) = claim_key(&mut tx, key, id).await? {
             return Ok(Created::Before(before));
         }
         tx.commit().await?;

@@ -9,6 +9,8 @@ use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::JobSpec;
 use hydroflex_openapi::status::{JobNotice, JobState, TimeSplit};
 use sha2::{Digest, Sha256};
+use std::fmt::Display;
+use std::str::FromStr;
 
 /// A job as it is accepted: checked, defaults filled in.
 #[derive(Debug, Clone)]
@@ -65,12 +67,13 @@ impl<Id: Copy> Created<Id> {
     }
 }
 
-/// Looks a key up, and claims it for `resource` if it is free.
-pub(crate) async fn claim_key(
+/// Claims the key of a request for what it makes, `id`; or says what an earlier request with it made.
+pub(crate) async fn claim_key<Id: FromStr + Display>(
     tx: &mut Transaction,
-    key: &IdempotencyKey,
-    resource: &str,
-) -> Result<Option<String>, LedgerError> {
+    key: Option<&IdempotencyKey>,
+    id: Id,
+) -> Result<Option<Id>, LedgerError> {
+    let Some(key) = key else { return Ok(None) };
     let claimed = tx
         .execute(
             "INSERT INTO idempotency_keys (key, body_sha256, resource, created_ms) \
@@ -78,7 +81,7 @@ pub(crate) async fn claim_key(
             values![
                 key.key.as_str(),
                 key.body_sha256.as_str(),
-                resource,
+                id.to_string(),
                 clock::now_ms()
             ],
         )
@@ -94,7 +97,7 @@ pub(crate) async fn claim_key(
         .await?
         .ok_or_else(|| LedgerError::corrupt("idempotency_keys.key", &key.key))?;
     if row.text("body_sha256")? == key.body_sha256 {
-        row.text("resource").map(Some)
+        row.parse("resource").map(Some)
     } else {
         Err(LedgerError::KeyReused { key: key.key.clone() })
     }
@@ -135,12 +138,7 @@ impl Ledger {
     ) -> Result<Created<JobId>, LedgerError> {
         let id = JobId::generate();
         let mut tx = self.pool.begin().await?;
-        if let Some(key) = key
-            && let Some(before) = claim_key(&mut tx, key, &id.to_string()).await?
-        {
-            let before = before
-                .parse()
-                .map_err(|_| LedgerError::corrupt("resource", &before))?;
+        if let Some(before) = claim_key(&mut tx, key, id).await? {
             return Ok(Created::Before(before));
         }
         tx.execute(
@@ -180,7 +178,8 @@ impl Ledger {
     ///
     /// # Errors
     /// Passes on what the database says.
-    pub async fn knows_key(&self, key: &IdempotencyKey) -> Result<bool, LedgerError> {
+    pub async fn knows_key(&self, key: Option<&IdempotencyKey>) -> Result<bool, LedgerError> {
+        let Some(key) = key else { return Ok(false) };
         let row = self
             .pool
             .row(

@@ -74,12 +74,7 @@ impl Ledger {
     ) -> Result<Created<SweepId>, LedgerError> {
         let id = SweepId::generate();
         let mut tx = self.pool.begin().await?;
-        if let Some(key) = key
-            && let Some(before) = claim_key(&mut tx, key, &id.to_string()).await?
-        {
-            let before = before
-                .parse()
-                .map_err(|_| LedgerError::corrupt("resource", &before))?;
+        if let Some(before) = claim_key(&mut tx, key, id).await? {
             return Ok(Created::Before(before));
         }
         tx.execute(

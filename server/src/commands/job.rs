@@ -1,10 +1,10 @@
 //! `hydroflex job`: jobs of a running service.
 
+use super::read_text;
 use crate::client::Client;
 use anyhow::Context;
 use hydroflex_openapi::catalogue::MeshInfo;
 use hydroflex_openapi::status::{JobPage, JobState, JobStatus};
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 /// Where the service is.
@@ -145,15 +145,7 @@ fn submit(
     wait: bool,
     service: &ServiceArgs,
 ) -> anyhow::Result<()> {
-    let mut text = String::new();
-    if file == Path::new("-") {
-        std::io::stdin()
-            .read_to_string(&mut text)
-            .context("cannot read the job from standard input")?;
-    } else {
-        text = std::fs::read_to_string(file)
-            .with_context(|| format!("cannot read the job {}", file.display()))?;
-    }
+    let mut text = read_text(file, "job")?;
     let client = Client::new(&service.url)?;
     if !meshes.is_empty() {
         text = with_meshes(&client, &text, meshes)?;

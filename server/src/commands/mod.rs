@@ -25,6 +25,19 @@ mod log;
 
 use anyhow::Context as _;
 use std::io::Write as _;
+use std::path::Path;
+
+/// The text of a file, or of standard input for `-`; `what` says in an error what it is.
+///
+/// # Errors
+/// If it cannot be read.
+pub(crate) fn read_text(file: &Path, what: &str) -> anyhow::Result<String> {
+    if file == Path::new("-") {
+        return std::io::read_to_string(std::io::stdin())
+            .with_context(|| format!("cannot read the {what} from standard input"));
+    }
+    std::fs::read_to_string(file).with_context(|| format!("cannot read the {what} {}", file.display()))
+}
 
 /// Prints a line for people to standard output. A closed pipe ends the command instead of a panic.
 ///

@@ -1,12 +1,12 @@
 //! `hydroflex sweep`: many networks on one data set of a running service, and what they found.
 
 use super::job::ServiceArgs;
+use super::read_text;
 use crate::client::{Client, bar};
 use anyhow::Context;
 use hydroflex_openapi::sweep::{SweepPage, SweepState, SweepStatus};
 use std::fmt::Write as _;
-use std::io::Read as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// How often a sweep is looked at.
@@ -99,7 +99,7 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     match command {
         Command::Submit { file, wait, service } => {
             let client = Client::new(&service.url)?;
-            let status: SweepStatus = client.post_text("/v1/sweeps", read(&file)?)?;
+            let status: SweepStatus = client.post_text("/v1/sweeps", read_text(&file, "sweep")?)?;
             if wait {
                 return watch(&client, &status.sweep_id.to_string(), service.json);
             }
@@ -128,17 +128,6 @@ pub fn run(command: Command) -> anyhow::Result<()> {
         Command::Retry { sweep, service } => post(&service, &sweep, "retry"),
         Command::Cancel { sweep, service } => post(&service, &sweep, "cancel"),
     }
-}
-
-fn read(file: &Path) -> anyhow::Result<String> {
-    if file == Path::new("-") {
-        let mut text = String::new();
-        std::io::stdin()
-            .read_to_string(&mut text)
-            .context("cannot read the sweep from standard input")?;
-        return Ok(text);
-    }
-    std::fs::read_to_string(file).with_context(|| format!("cannot read the sweep {}", file.display()))
 }
 
 fn post(service: &ServiceArgs, sweep: &str, what: &str) -> anyhow::Result<()> {

@@ -167,12 +167,16 @@ impl Coordinator {
             .filter(|(state, _)| !state.is_final())
             .map(|(_, count)| count)
             .sum();
+        self.refuse_beyond("jobs", unfinished)
+    }
+
+    fn refuse_beyond(&self, what: &str, unfinished: u64) -> Result<(), ApiError> {
         let most = self.config().most_jobs;
         if unfinished < most {
             return Ok(());
         }
         Err(ApiError::TooManyRequests(format!(
-            "{unfinished} jobs are unfinished, at most {most} are looked after; try again when some are done"
+            "{unfinished} {what} are unfinished, at most {most} are looked after; try again when some are done"
         )))
     }
 
@@ -246,13 +250,7 @@ impl Coordinator {
     /// Says how many there are.
     pub async fn refuse_sweep_if_full(&self) -> Result<(), ApiError> {
         let unfinished = self.ledger().unfinished_sweeps().await?;
-        let most = self.config().most_jobs;
-        if unfinished < most {
-            return Ok(());
-        }
-        Err(ApiError::TooManyRequests(format!(
-            "{unfinished} sweeps are unfinished, at most {most} are looked after; try again when some are done"
-        )))
+        self.refuse_beyond("sweeps", unfinished)
     }
 
     /// Looks after every job until told to stop.

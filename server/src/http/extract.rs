@@ -1,12 +1,15 @@
 //! Reading requests: every refusal names the field, the value and what is allowed.
 
 use super::error::ApiError;
+use axum::Json;
 use axum::body::Bytes;
 use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, header};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
 use hydroflex_ledger::IdempotencyKey;
 use hydroflex_openapi::problem::FieldError;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_path_to_error::Segment;
 use std::str::FromStr;
@@ -289,6 +292,19 @@ pub fn idempotency_key(headers: &HeaderMap, body: &[u8]) -> Result<Option<Idempo
             FieldError::new("Idempotency-Key", "not a key").allowed("1 to 128 visible ASCII characters"),
         )),
     }
+}
+
+/// What was asked for is accepted: where to look for it, and after how many seconds.
+pub fn accepted<T: Serialize>(location: String, look_after_s: u32, status: T) -> Response {
+    (
+        StatusCode::ACCEPTED,
+        [
+            (header::LOCATION, location),
+            (header::RETRY_AFTER, look_after_s.to_string()),
+        ],
+        Json(status),
+    )
+        .into_response()
 }
 
 #[cfg(test)]

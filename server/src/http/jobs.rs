@@ -2,11 +2,11 @@
 
 use super::AppState;
 use super::error::ApiError;
-use super::extract::{Id, JsonBody, Page, PageQuery, idempotency_key};
+use super::extract::{Id, JsonBody, Page, PageQuery, accepted, idempotency_key};
 use axum::Json;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::HeaderMap;
+use axum::response::Response;
 use hydroflex_ledger::{Created, JobRecord, Ledger, LedgerError, clock};
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::JobSpec;
@@ -35,11 +35,7 @@ pub async fn submit(
     body: JsonBody<JobSpec>,
 ) -> Result<Response, ApiError> {
     let key = idempotency_key(&headers, &body.bytes)?;
-    let is_repeated = match &key {
-        Some(key) => state.ledger().knows_key(key).await?,
-        None => false,
-    };
-    if !is_repeated {
+    if !state.ledger().knows_key(key.as_ref()).await? {
         state.coordinator().refuse_if_full().await?;
     }
     let new = state.coordinator().accept(body.value).await?;
@@ -50,15 +46,7 @@ pub async fn submit(
     }
     let job = show_job(state.ledger(), created.id()).await?;
     let location = format!("/v1/jobs/{}", job.job_id);
-    Ok((
-        StatusCode::ACCEPTED,
-        [
-            (header::LOCATION, location),
-            (header::RETRY_AFTER, "1".to_owned()),
-        ],
-        Json(job),
-    )
-        .into_response())
+    Ok(accepted(location, 1, job))
 }
 
 /// List jobs, newest first

@@ -2,11 +2,11 @@
 
 use super::AppState;
 use super::error::ApiError;
-use super::extract::{Id, JsonBody, Page, PageQuery, idempotency_key};
+use super::extract::{Id, JsonBody, Page, PageQuery, accepted, idempotency_key};
 use crate::sweeps;
 use axum::Json;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use hydroflex_ledger::{Created, Ledger, SweepRecord};
 use hydroflex_openapi::id::SweepId;
@@ -35,11 +35,7 @@ pub async fn submit(
     body: JsonBody<SweepRequest>,
 ) -> Result<Response, ApiError> {
     let key = idempotency_key(&headers, &body.bytes)?;
-    let is_repeated = match &key {
-        Some(key) => state.ledger().knows_key(key).await?,
-        None => false,
-    };
-    if !is_repeated {
+    if !state.ledger().knows_key(key.as_ref()).await? {
         state.coordinator().refuse_sweep_if_full().await?;
     }
     let sweep = state.coordinator().accept_sweep(&body.value).await?;
@@ -53,15 +49,7 @@ pub async fn submit(
     }
     let status = show_sweep(state.ledger(), created.id()).await?;
     let location = format!("/v1/sweeps/{}", status.sweep_id);
-    Ok((
-        StatusCode::ACCEPTED,
-        [
-            (header::LOCATION, location),
-            (header::RETRY_AFTER, "2".to_owned()),
-        ],
-        Json(status),
-    )
-        .into_response())
+    Ok(accepted(location, 2, status))
 }
 
 /// List sweeps, newest first

@@ -2,11 +2,11 @@
 
 use super::AppState;
 use super::error::ApiError;
-use super::extract::{Id, JsonBody, idempotency_key};
+use super::extract::{Id, JsonBody, accepted, idempotency_key};
 use axum::Json;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::HeaderMap;
+use axum::response::Response;
 use hydroflex_openapi::id::TrainingId;
 use hydroflex_openapi::problem::Problem;
 use hydroflex_openapi::status::{TrainingRequest, TrainingStatus};
@@ -38,15 +38,7 @@ pub async fn submit(
         .await?;
     let training = find(&state, created.id()).await?;
     let location = format!("/v1/trainings/{}", training.training_id);
-    Ok((
-        StatusCode::ACCEPTED,
-        [
-            (header::LOCATION, location),
-            (header::RETRY_AFTER, "2".to_owned()),
-        ],
-        Json(training),
-    )
-        .into_response())
+    Ok(accepted(location, 2, training))
 }
 
 /// Show a training with its progress
