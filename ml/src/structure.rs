@@ -1,5 +1,6 @@
 //! Structures by name: the paper's letters, and our own.
 
+use hydroflex_openapi::job::TrainingSpec;
 use hydroflex_openapi::model::{Activation, DenseLayer};
 
 /// What is trained.
@@ -98,6 +99,15 @@ pub enum StructureError {
     /// No letter.
     #[error("the structure is empty; give \"best\", or letters such as RLR")]
     Empty,
+    /// More than a hidden layer may have.
+    #[error(
+        "the width in windows comes to {width} values a layer, allowed is at most {}",
+        TrainingSpec::WIDEST
+    )]
+    TooWide {
+        /// Width.
+        width: usize,
+    },
     /// Width 0.
     #[error("the width of the hidden layers must be at least 1")]
     NoWidth,

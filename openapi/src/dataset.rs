@@ -227,8 +227,8 @@ pub struct WindowFacts {
     /// The published script, counted from the start of the run, mean over the runs that settle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub script_s: Option<f64>,
-    /// Time in which the slowest damped motion decays to 1 %: from the eigenvalues of the machine with its
-    /// largest payload, oil included, valves shut.
+    /// Time in which the slowest damped motion decays to 1 %: from the eigenvalues of the machine of the job's softest
+    /// material with its largest payload, oil included, valves shut.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub eigenvalues_s: Option<f64>,
     /// Every structural channel by itself.

@@ -477,6 +477,11 @@ fn default_structure() -> String {
     "best".to_owned()
 }
 
+impl TrainingSpec {
+    /// Most values of a hidden layer whose width is asked for.
+    pub const WIDEST: usize = 4096;
+}
+
 impl Default for TrainingSpec {
     fn default() -> Self {
         Self {

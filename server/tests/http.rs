@@ -178,6 +178,19 @@ async fn a_refusal_names_field_value_and_what_is_allowed() {
             r#"{"runs": 80, "train": [{"targets": ["wind_m_per_s"]}]}"#,
             "/train/0/targets/0",
         ),
+        // What would fail only after every run is there.
+        (
+            r#"{"runs": 80, "train": [{"structure": "RDTL"}]}"#,
+            "/train/0/structure",
+        ),
+        (
+            r#"{"runs": 80, "train": [{"structure": "RLR", "output_steps": 150, "window": {"rule": "given", "window_s": 0.5}}]}"#,
+            "/train/0/output_steps",
+        ),
+        (
+            r#"{"runs": 80, "duration_s": 10, "train": [{"structure": "RLR", "width_windows": 16, "window": {"rule": "given", "window_s": 5}}]}"#,
+            "/train/0/width_windows",
+        ),
     ] {
         let problem = desk.post("/v1/jobs", body).await.problem(422);
         let pointers: Vec<&str> = problem
@@ -572,6 +585,18 @@ async fn a_sweep_is_accepted_shown_and_cancelled_and_a_bad_one_refused_by_name()
     ] {
         refused(&desk, id, json(&body), pointers).await;
     }
+    // More windows than a job may have trainings.
+    let windows = |count: i32| -> Vec<serde_json::Value> {
+        let one = |k: i32| serde_json::json!({ "rule": "given", "window_s": 0.1 + 0.001 * f64::from(k) });
+        (0..count).map(one).collect()
+    };
+    let wide = serde_json::json!({ "dataset_id": id, "windows": windows(300), "structures": ["L"] });
+    let accepted = desk.post("/v1/sweeps", &wide.to_string()).await;
+    assert_eq!(accepted.status, 202);
+    let mut late = windows(300);
+    late[280]["window_s"] = serde_json::json!(99.0);
+    let wrong = serde_json::json!({ "windows": late, "structures": ["L"] });
+    refused(&desk, id, wrong, &["/windows/280/window_s"]).await;
     let seeds: Vec<u64> = (0..1025).collect();
     let many = serde_json::json!({ "seeds": seeds, "spec": { "window": window } });
     refused(&desk, id, many, &[""]).await;

@@ -22,7 +22,7 @@ use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::{RunSettings, SolverStatistics};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -160,6 +160,14 @@ fn text(levels: &BTreeMap<String, Table>) -> String {
     out + "}\n"
 }
 
+fn machine_of(run: &str) -> &str {
+    run.split(',').next().unwrap_or(run)
+}
+
+fn machines(table: &Table) -> BTreeSet<&str> {
+    table.keys().map(|run| machine_of(run)).collect()
+}
+
 #[test]
 fn runs_take_the_path_and_the_steps_that_they_took() {
     let found = measured();
@@ -168,12 +176,18 @@ fn runs_take_the_path_and_the_steps_that_they_took() {
         serde_json::from_str(&std::fs::read_to_string(snapshot()).unwrap_or_else(|_| "{}".to_owned()))
             .unwrap();
     if std::env::var_os("HYDROFLEX_UPDATE_STATISTICS").is_some() {
-        levels.entry(level.to_owned()).or_default().extend(found);
+        let table = levels.entry(level.to_owned()).or_default();
+        table.retain(|run, _| !machines(&found).contains(machine_of(run)));
+        table.extend(found);
         std::fs::write(snapshot(), text(&levels)).unwrap();
         return;
     }
     let same = levels.get(level);
     let expected = same.or_else(|| levels.values().next()).unwrap();
+    let gone = expected
+        .keys()
+        .filter(|run| machines(&found).contains(machine_of(run)) && !found.contains_key(*run))
+        .map(|run| format!("{run} is no longer there"));
     let differences: Vec<String> = found
         .iter()
         .filter_map(|(run, counts)| {
@@ -181,6 +195,7 @@ fn runs_take_the_path_and_the_steps_that_they_took() {
             let before = expected.get(run);
             (!before.is_some_and(fits)).then(|| format!("{run}: {counts:?}, was {before:?}"))
         })
+        .chain(gone)
         .collect();
     assert!(
         differences.is_empty(),

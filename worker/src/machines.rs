@@ -7,7 +7,6 @@ use hydroflex_openapi::problem::FieldError;
 use hydroflex_sim::machine::{Machine, MachineError, MeshTexts};
 use hydroflex_sim::scenario::validate_materials;
 use hydroflex_sim::simulator::{Simulator, SimulatorError};
-use rayon::prelude::*;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -80,11 +79,12 @@ impl ReadyMachine {
     }
 
     /// The simulator of the machine made of one of the job's materials, or as its file says.
+    ///
+    /// # Panics
+    /// When this machine was not made for so many materials.
     #[must_use]
     pub fn simulator_of(&self, material: Option<usize>) -> &Simulator {
-        material
-            .and_then(|index| self.of_materials.get(index))
-            .unwrap_or(&self.simulator)
+        material.map_or(&self.simulator, |index| &self.of_materials[index])
     }
 
     /// Every simulator that the job's runs need.
@@ -141,11 +141,10 @@ impl Machines {
             ValueOrRange::Range { max, .. } => max > 0.0,
         };
         let refused = |error| RefusedMachine::Structure(Arc::new(error));
-        machine
-            .simulators()
-            .par_iter()
-            .try_for_each(|simulator| simulator.prepare(with_payload))
-            .map_err(refused)?;
+        // One after the other: a reduction has the cores to itself, and its factor in memory.
+        for simulator in machine.simulators() {
+            simulator.prepare(with_payload).map_err(refused)?;
+        }
         Ok(machine)
     }
 

@@ -9,7 +9,7 @@ use crate::noise::Noise;
 use crate::runs::Runs;
 use crate::scaling::Scaling;
 use crate::scheduled::{RANGE_FACTOR, Sample, ScheduledMap};
-use crate::structure::{Form, Structure};
+use crate::structure::{Form, Structure, StructureError};
 use crate::window::{Series, WindowError, Windows, window_steps};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
@@ -233,6 +233,11 @@ impl Problem {
             _ => return Err(TrainError::NoWindow),
         };
         let width = spec.width.or(spec.width_windows.map(|times| times * window));
+        if let (Some(width), Some(_)) = (width, spec.width_windows)
+            && width > TrainingSpec::WIDEST
+        {
+            return Err(StructureError::TooWide { width }.into());
+        }
         let structure = Structure::parse_any(&spec.structure, window, width)?;
         let output_steps = spec.output_steps.unwrap_or(1);
         if output_steps > 1 && (structure.linear_skip || structure.form != Form::Dense) {

@@ -238,7 +238,7 @@ fn body_text(out: &mut String, body: &BodySummary) -> std::fmt::Result {
         }
         for row in &basis.deflections {
             let micrometres = row.reduced_m_per_n.map(|m| 1e9 * m);
-            let lost = row.lost_ratio.map(|part| 100.0 * part);
+            let lost = row.lost_ratio.map(|part| 100.0 * part.max(0.0));
             writeln!(
                 out,
                 "    1 kN at {:10} x {:.3} (-{:.3} %)  y {:.3} (-{:.3} %)  z {:.3} (-{:.3} %) µm",

@@ -22,6 +22,7 @@ use hydroflex_openapi::job::{JobSpec, TrainingSpec};
 use hydroflex_openapi::problem::FieldError;
 use hydroflex_openapi::status::JobState;
 use hydroflex_openapi::sweep::SweepRequest;
+use hydroflex_sim::scenario::validate::MAX_TRAININGS;
 use machines::{CheckedMachine, MachineDesk};
 use plan::{Situation, shard_sizes};
 use std::collections::HashSet;
@@ -221,27 +222,37 @@ impl Coordinator {
         let mut channels = machine.ready().simulator.channels().to_vec();
         channels.retain(|channel| record.spec.keeps(&channel.name));
         let sweep = Sweep::new(asked, &channels).map_err(ApiError::Invalid)?;
-        let (places, train): (Vec<_>, Vec<_>) = sweep.probes().into_iter().unzip();
-        let job = JobSpec { train, ..record.spec };
-        let errors = match machine.validate(&job) {
-            Ok(()) => return Ok(sweep),
-            Err(errors) => errors,
-        };
+        let probes = sweep.probes();
         let mut told = HashSet::new();
-        let of_request = errors.into_iter().map(|mut error| {
-            let place = error.pointer.strip_prefix("/train/").and_then(|rest| {
-                let at = rest.find('/')?;
-                Some((*places.get(rest[..at].parse::<usize>().ok()?)?, &rest[at..]))
-            });
-            error.pointer = match place {
-                Some((place, rest)) => sweep.pointer(place, rest),
-                // What the data set's job lacks for it.
-                None => format!("/dataset_id{}", error.pointer),
+        let mut errors = Vec::new();
+        // As many at a time as a job may ask for.
+        for probes in probes.chunks(MAX_TRAININGS) {
+            let train = probes.iter().map(|(_, training)| training.clone()).collect();
+            let job = JobSpec {
+                train,
+                ..record.spec.clone()
             };
-            error
-        });
-        let errors = of_request.filter(|error| told.insert(error.pointer.clone()));
-        Err(ApiError::Invalid(errors.collect()))
+            for mut error in machine.validate(&job).err().into_iter().flatten() {
+                let place = error.pointer.strip_prefix("/train/").and_then(|rest| {
+                    let at = rest.find('/')?;
+                    let (place, _) = probes.get(rest[..at].parse::<usize>().ok()?)?;
+                    Some((*place, &rest[at..]))
+                });
+                error.pointer = match place {
+                    Some((place, rest)) => sweep.pointer(place, rest),
+                    // What the data set's job lacks for it.
+                    None => format!("/dataset_id{}", error.pointer),
+                };
+                if told.insert(error.pointer.clone()) {
+                    errors.push(error);
+                }
+            }
+        }
+        if errors.is_empty() {
+            Ok(sweep)
+        } else {
+            Err(ApiError::Invalid(errors))
+        }
     }
 
     /// Refuses one more sweep where there are as many as jobs may be.

@@ -2,16 +2,17 @@
 //!
 //! A network that looks at windows longer than a third of a run sees few of them, and hardly any of a machine that has
 //! settled. Which window a job's networks will have is known before it runs: they take it from the job's settling runs, which are
-//! functions of the job. The first of them are simulated here, with the largest payload and the softest material: all that count if runs go side by side (a few
-//! milliseconds), two where each run takes a multiple of that. The bodies are reduced by then, as a job is not
-//! accepted before they are.
+//! functions of the job. The first of them are simulated here, with the largest payload and the softest material: eight if runs go side by side (a few
+//! milliseconds), two where each run takes a multiple of that, none where even these would keep a submission
+//! waiting. Then the eigenvalues say how long the window is, about. The bodies are reduced by then, as a job is
+//! not accepted before they are.
 
 use hydroflex_dataset::RunSamples;
 use hydroflex_dataset::window::WindowCollector;
 use hydroflex_openapi::dataset::WindowFacts;
-use hydroflex_openapi::job::{JobSpec, MaterialRef, ValueOrRange, WindowRule};
+use hydroflex_openapi::job::{Integrator, JobSpec, MaterialRef, ValueOrRange, WindowRule};
 use hydroflex_openapi::status::JobNotice;
-use hydroflex_sim::scenario::plan_settling_run;
+use hydroflex_sim::scenario::{plan_settling_run, settling_steps};
 use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::summary::eigenvalue_window_s;
 use hydroflex_sim::trajectory::{RunInput, RunSettings};
@@ -22,6 +23,8 @@ const WINDOWS_LEAST: f64 = 3.0;
 /// Settling runs that are looked at, side by side and one by one.
 const RUNS_TOGETHER: u64 = 8;
 const RUNS_ALONE: u64 = 2;
+/// Steps of all these runs together up to which a submission waits for them: a second or two on the slowest path.
+const STEPS_MOST: f64 = 20_000.0;
 /// Proposed durations are multiples of this where the sample time allows it, s.
 const ROUND_S: f64 = 0.1;
 
@@ -42,7 +45,8 @@ fn window(machine: &ReadyMachine, spec: &JobSpec) -> Option<JobNotice> {
     let simulated = rules
         .iter()
         .any(|rule| matches!(rule, WindowRule::Band | WindowRule::Paper))
-        .then(|| settling(machine, spec, softest, payload_kg));
+        .then(|| settling(machine, spec, softest, payload_kg))
+        .flatten();
     let (window_s, how) = rules
         .iter()
         .filter_map(|rule| length(*rule, simulator, payload_kg, simulated.as_ref()))
@@ -113,15 +117,33 @@ fn softest(spec: &JobSpec) -> Option<usize> {
         .map(|(index, _)| index)
 }
 
-/// Windows of the job's first settling runs with this material and payload.
-fn settling(machine: &ReadyMachine, spec: &JobSpec, material: Option<usize>, payload_kg: f64) -> WindowFacts {
+/// Windows of the job's first settling runs with this material and payload; none if it has no such run, or they would take
+/// too long.
+fn settling(
+    machine: &ReadyMachine,
+    spec: &JobSpec,
+    material: Option<usize>,
+    payload_kg: f64,
+) -> Option<WindowFacts> {
     let simulator = machine.simulator_of(material);
     let settings = RunSettings {
         integrator: spec.integrator,
         sample_time_s: spec.sample_time_s,
     };
     let together = simulator.runs_side_by_side(&settings, payload_kg > 0.0);
-    let runs = if together { RUNS_TOGETHER } else { RUNS_ALONE };
+    let runs = spec
+        .settling_runs
+        .min(if together { RUNS_TOGETHER } else { RUNS_ALONE });
+    let steps_per_sample = match spec.integrator {
+        Integrator::Accurate => 1.0,
+        Integrator::TrapezoidalIndex2 { step_s } | Integrator::GeneralizedAlpha { step_s } => {
+            (spec.sample_time_s / step_s).max(1.0)
+        }
+    };
+    let steps = (runs * settling_steps(spec) as u64) as f64 * steps_per_sample;
+    if runs == 0 || steps > STEPS_MOST {
+        return None;
+    }
     let same = JobSpec {
         payload_kg: ValueOrRange::Value(payload_kg),
         settling_runs: runs,
@@ -138,7 +160,7 @@ fn settling(machine: &ReadyMachine, spec: &JobSpec, material: Option<usize>, pay
             columns: trajectory.columns,
         });
     }
-    windows.finish()
+    Some(windows.finish())
 }
 
 /// Shortest duration of enough windows, rounded up.
@@ -192,6 +214,15 @@ mod tests {
         assert_eq!(of(&machine, &longer), []);
         let given = job(r#"{"runs": 4, "train": [{"window": {"rule": "given", "window_s": 0.4}}]}"#);
         assert_eq!(of(&machine, &given)[0].proposed, Some(1.2.into()));
+        // Without settling runs, or with such as would take hours, the eigenvalues say it.
+        for text in [
+            r#"{"runs": 4, "settling_runs": 0, "payload_kg": 200}"#,
+            r#"{"runs": 4, "payload_kg": 200, "sample_time_s": 1e-5,
+                "integrator": {"kind": "generalized-alpha", "step_s": 1e-9}}"#,
+        ] {
+            let notices = of(&machine, &job(text));
+            assert!(notices[0].detail.contains("slowest motion"), "{notices:?}");
+        }
         let eigenvalues =
             job(r#"{"runs": 4, "payload_kg": 100, "train": [{"window": {"rule": "eigenvalues"}}]}"#);
         assert_eq!(of(&machine, &eigenvalues)[0].proposed, Some(1.5.into()));

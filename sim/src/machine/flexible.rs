@@ -18,7 +18,7 @@ pub struct FlexibleBody {
     /// Position among the machine's bodies.
     pub body_index: usize,
     /// Checked mesh.
-    pub mesh: Mesh,
+    pub mesh: Arc<Mesh>,
     /// SHA-256 of the mesh file.
     pub mesh_sha256: [u8; 32],
     /// Mass and stiffness that came with the mesh, with the SHA-256 of their files.

@@ -13,6 +13,7 @@ use hydroflex_openapi::machine::{
     MaterialSpec, Selection, SensorSpec, WeightKind,
 };
 use nalgebra::Vector3;
+use std::sync::Arc;
 
 impl From<&MaterialSpec> for Material {
     fn from(spec: &MaterialSpec) -> Self {
@@ -101,7 +102,7 @@ pub(super) fn flexible_body(
         boundary_with_payload: boundaries(true),
         interfaces,
         sensor_nodes,
-        mesh,
+        mesh: Arc::new(mesh),
         mesh_sha256,
     })
 }

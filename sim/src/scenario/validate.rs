@@ -344,10 +344,14 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
         structure == "best"
             || (!structure.is_empty()
                 && structure.len() <= 32
-                && structure.chars().all(|c| "LTSRED".contains(c))),
+                && structure.chars().all(|c| "LTSRED".contains(c))
+                && structure
+                    .as_bytes()
+                    .windows(2)
+                    .all(|pair| pair[0] != b'D' || pair[1] == b'L')),
         at("structure"),
         structure,
-        "best, or letters of L, T, S, R, E, D as in TLSLTLSLT",
+        "best, or letters of L, T, S, R, E, D as in TLSLTLSLT; D (dropout) before an L or the end",
     );
     for (field, names) in [("inputs", &training.inputs), ("targets", &training.targets)] {
         for (k, name) in names.iter().enumerate() {
@@ -368,7 +372,7 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
         }
     }
     window(spec, training, &at("window"), errors);
-    shape(training, &at, errors);
+    shape(spec, training, &at, errors);
     errors.require(
         training.epochs.is_none_or(|epochs| epochs >= 1),
         at("epochs"),
@@ -406,13 +410,14 @@ fn train(spec: &JobSpec, training: &TrainingSpec, index: usize, channels: &[Chan
 }
 
 /// Width, outputs and dropout of a network.
-fn shape(training: &TrainingSpec, at: &impl Fn(&str) -> String, errors: &mut Errors) {
+fn shape(spec: &JobSpec, training: &TrainingSpec, at: &impl Fn(&str) -> String, errors: &mut Errors) {
+    const WIDEST: usize = TrainingSpec::WIDEST;
     let structure = training.structure.as_str();
     errors.require(
-        training.width.is_none_or(|width| (1..=4096).contains(&width)),
+        training.width.is_none_or(|width| (1..=WIDEST).contains(&width)),
         at("width"),
         training.width,
-        "1 to 4096",
+        format!("1 to {WIDEST}"),
     );
     errors.require(
         training
@@ -429,6 +434,28 @@ fn shape(training: &TrainingSpec, at: &impl Fn(&str) -> String, errors: &mut Err
         at("output_steps"),
         training.output_steps,
         "1 to 1000; above 1 for structures of letters",
+    );
+    // Each of several estimated samples has the whole window before it.
+    let window_steps = match training.window {
+        WindowRule::Given { window_s } => (window_s / spec.sample_time_s).round(),
+        _ => 1.0,
+    };
+    let rows = spec.steps() as f64 + 1.0;
+    errors.require(
+        training
+            .output_steps
+            .is_none_or(|steps| steps == 1 || window_steps + steps as f64 <= rows),
+        at("output_steps"),
+        training.output_steps,
+        format!("with the window's at most the {rows} samples of a run"),
+    );
+    errors.require(
+        training
+            .width_windows
+            .is_none_or(|times| window_steps * times as f64 <= WIDEST as f64),
+        at("width_windows"),
+        training.width_windows,
+        format!("at most {WIDEST} values a layer; this window has {window_steps} steps"),
     );
     errors.require(
         training

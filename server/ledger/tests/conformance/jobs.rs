@@ -2,12 +2,12 @@
 
 use crate::{new_dataset, new_job, result};
 use hydroflex_ledger::{
-    CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, ShardResult,
+    CommitOutcome, Created, IdempotencyKey, Ledger, LedgerError, NewDataset, NewJob, ShardResult,
 };
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::TrainingSpec;
-use hydroflex_openapi::status::{JobState, TrainingState};
+use hydroflex_openapi::status::{JobNotice, JobState, TrainingState};
 
 on_every_engine![
     a_job_its_shards_and_its_event_appear_together,
@@ -17,6 +17,7 @@ on_every_engine![
     urgent_jobs_go_first,
     a_job_is_computed_on_one_instruction_set,
     given_up_runs_are_done_again_and_nothing_else,
+    remarks_are_kept_with_the_job_and_no_more_than_eight,
 ];
 
 async fn a_job_its_shards_and_its_event_appear_together(ledger: Ledger) {
@@ -130,6 +131,26 @@ async fn a_job_is_computed_on_one_instruction_set(ledger: Ledger) {
     assert_eq!(job_of("c").await, None);
     assert_eq!(job_of("b").await, Some((first, v3)));
     assert_eq!(job_of("b").await, None);
+}
+
+async fn remarks_are_kept_with_the_job_and_no_more_than_eight(ledger: Ledger) {
+    let notice = |number: u64| JobNotice {
+        pointer: format!("/{number}"),
+        detail: "short".to_owned(),
+        proposed: Some(number.into()),
+    };
+    let new = NewJob {
+        notices: (0..9).map(notice).collect(),
+        ..new_job(&[4])
+    };
+    let id = ledger.create_job(&new, None).await.unwrap().id();
+    let silent = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    let expected: Vec<JobNotice> = (0..8).map(notice).collect();
+    assert_eq!(ledger.notices(id).await.unwrap(), expected);
+    assert_eq!(ledger.notices(silent).await.unwrap(), []);
+    // What happens later is no remark.
+    assert!(ledger.cancel_job(silent).await.unwrap());
+    assert_eq!(ledger.notices(silent).await.unwrap(), []);
 }
 
 async fn given_up_runs_are_done_again_and_nothing_else(ledger: Ledger) {
