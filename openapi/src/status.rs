@@ -166,9 +166,10 @@ pub struct TimeSplit {
     pub simulate_s: f64,
     /// Encoding and hashing.
     pub encode_s: f64,
-    /// Writing to the store.
+    /// Writing to the store, beside the next shard of the same worker.
     pub put_s: f64,
-    /// Waiting for the ledger and for the next shard, from one shard of the job to the next.
+    /// Neither simulating nor encoding, from one shard of the job to the next: waiting for the ledger, for the
+    /// next shard, or for the store to take the one before.
     pub wait_s: f64,
 }
 

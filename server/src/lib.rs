@@ -8,6 +8,7 @@
     )
 )]
 
+mod allocator;
 pub mod calibration;
 pub mod sweeps;
 pub mod http;

@@ -30,7 +30,7 @@ pub struct EncodedShard {
     pub sha256: String,
     /// Runs without samples.
     pub failed_runs: u64,
-    /// Time spent; `put_s` and `wait_s` still to come.
+    /// Time spent; `put_s` and `wait_s` come with the delivery.
     pub spent: TimeSplit,
 }
 

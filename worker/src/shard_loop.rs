@@ -1,12 +1,13 @@
-//! Claim, simulate, put, commit; and around it the heartbeat, the limits, the end.
+//! Claim, simulate, deliver; and around it the heartbeat, the limits, the end.
 
+use crate::delivery::Delivery;
 use crate::machines::{Machines, RefusedMachine};
 use crate::memory;
 use crate::shard::{self, EncodedShard, ShardControl, ShardFailure};
 use anyhow::Context;
-use hydroflex_ledger::blobs::{BlobError, Blobs};
+use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
-use hydroflex_ledger::{Claim, CommitOutcome, Ledger, LedgerError, ShardResult, identity};
+use hydroflex_ledger::{Claim, Ledger, LedgerError, identity};
 use hydroflex_openapi::id::JobId;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -19,9 +20,7 @@ use tracing::Instrument;
 const BEAT: Duration = Duration::from_secs(1);
 /// How often a shard in work asks whether it is still wanted.
 const LOOK: Duration = Duration::from_millis(500);
-/// Longest wait between two looks for work.
-const LONGEST_IDLE: Duration = Duration::from_millis(100);
-/// How long the database or the store may be away before a shard is given back.
+/// How long the database or the store may be away before this process gives up.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 /// How a worker works.
@@ -162,43 +161,54 @@ impl Worker {
         deadline: Option<Instant>,
         alive: &AtomicBool,
     ) -> Result<Option<Ended>, LedgerError> {
-        let mut idle = Duration::from_millis(20);
-        // The job of the last shard and when its object was there: what passes until the next shard of
-        // the same job is time that the job's worker waits.
+        let longest_idle = self.ledger.longest_idle();
+        let mut idle = longest_idle / 4;
+        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone());
+        // The job of the last shard and when this process was done with it: what passes until the next
+        // shard of the same job is time that the job's worker waits.
         let mut last: Option<(JobId, Instant)> = None;
         loop {
             if self.told_to_stop() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
+                delivery.finish().await?;
                 return Ok(Some(Ended::Drained));
             }
             if !alive.load(Ordering::Relaxed) {
+                delivery.finish().await?;
                 return Ok(None);
             }
             let asked = Instant::now();
             match self.ledger.begin_shard(name).await {
                 Ok(Some(claim)) => {
                     crash_point("begin");
-                    idle = Duration::from_millis(20);
+                    idle = longest_idle / 4;
+                    // A death is charged to every shard in hand. One that has met a death is alone in hand, so
+                    // that no shard is charged twice for what another does.
+                    let alone = claim.shard.attempt > 1;
+                    if alone {
+                        delivery.finish().await?;
+                    }
                     let since = match last {
                         Some((job, at)) if job == claim.job.id => at,
                         _ => asked,
                     };
-                    let mut work = Work {
-                        wait_s: since.elapsed().as_secs_f64(),
-                        ended: None,
-                    };
-                    let spoiled = self.do_shard(&claim, &mut work).await?;
-                    last = work.ended.map(|at| (claim.job.id, at));
-                    if spoiled {
+                    if self.do_shard(&claim, since.elapsed(), &mut delivery).await? {
+                        // It may hold memory that this process has not got, so not for long.
+                        let _ = tokio::time::timeout(BEAT, delivery.finish()).await;
                         return Ok(Some(Ended::Spoiled));
+                    }
+                    last = Some((claim.job.id, Instant::now()));
+                    if alone {
+                        delivery.finish().await?;
                     }
                 }
                 Ok(None) => {
+                    delivery.finish().await?;
                     let mut stop = self.stop.clone();
                     tokio::select! {
                         _ = stop.wait_for(|stop| *stop) => {}
                         () = tokio::time::sleep(idle) => {}
                     }
-                    idle = (idle * 2).min(LONGEST_IDLE);
+                    idle = (idle * 2).min(longest_idle);
                 }
                 Err(error) if error.is_transient() => {
                     tracing::warn!(%error, "the database is away; trying again");
@@ -213,21 +223,36 @@ impl Worker {
         *self.stop.borrow()
     }
 
-    /// Does one shard, or gives it back with the reason. True if this process is spoiled.
-    async fn do_shard(&self, claim: &Claim, work: &mut Work) -> Result<bool, LedgerError> {
+    /// Does one shard and sends it off, or gives it back with the reason. True if this process is spoiled.
+    async fn do_shard(
+        &self,
+        claim: &Claim,
+        waited: Duration,
+        delivery: &mut Delivery,
+    ) -> Result<bool, LedgerError> {
         let shard = &claim.shard;
         let span = tracing::info_span!(
             "shard", job = %shard.job_id, kind = %shard.kind, first_run = shard.first_run, runs = shard.run_count,
             attempt = shard.attempt
         );
-        self.do_shard_in(claim, work).instrument(span).await
+        self.do_shard_in(claim, waited, delivery).instrument(span).await
     }
 
-    async fn do_shard_in(&self, claim: &Claim, work: &mut Work) -> Result<bool, LedgerError> {
+    async fn do_shard_in(
+        &self,
+        claim: &Claim,
+        waited: Duration,
+        delivery: &mut Delivery,
+    ) -> Result<bool, LedgerError> {
         let shard = &claim.shard;
         tracing::debug!("begun");
         match self.simulate(claim).await {
-            Simulated::Done(encoded) => self.hand_in(claim, encoded, work).await?,
+            Simulated::Done(mut encoded) => {
+                let done = Instant::now();
+                delivery.finish().await?;
+                encoded.spent.wait_s = (waited + done.elapsed()).as_secs_f64();
+                delivery.begin(claim.clone(), encoded);
+            }
             Simulated::Stopped => {
                 self.ledger.release_shard(claim).await?;
             }
@@ -322,86 +347,6 @@ impl Worker {
             }
         }
     }
-
-    /// Puts the object, then commits: in this order, so that what is committed is there.
-    async fn hand_in(
-        &self,
-        claim: &Claim,
-        encoded: EncodedShard,
-        work: &mut Work,
-    ) -> Result<(), LedgerError> {
-        let object = claim.object();
-        let start = Instant::now();
-        if let Err(error) = self.put(&object, &encoded).await {
-            tracing::warn!(%error, object, "the object could not be put");
-            let reason = format!("the store refused the object: {error}");
-            self.ledger
-                .lose_shard(claim.shard.id, claim.shard.epoch, &reason)
-                .await?;
-            return Ok(());
-        }
-        crash_point("put");
-        let mut spent = encoded.spent;
-        spent.put_s = start.elapsed().as_secs_f64();
-        spent.wait_s = work.wait_s;
-        work.ended = Some(Instant::now());
-        let result = ShardResult {
-            size_bytes: encoded.content.len() as u64,
-            sha256: encoded.sha256,
-            failed_runs: encoded.failed_runs,
-            object,
-            spent,
-        };
-        let outcome = self.commit(claim, &result).await?;
-        crash_point("commit");
-        match outcome {
-            CommitOutcome::Committed => tracing::debug!(simulate_s = spent.simulate_s, "committed"),
-            CommitOutcome::Fenced => {
-                tracing::info!(object = result.object, "fenced off; deleting the object");
-                if let Err(error) = self.blobs.delete(&result.object).await {
-                    tracing::warn!(%error, "an orphan stays until it is collected");
-                }
-            }
-        }
-        Ok(())
-    }
-
-    async fn put(&self, object: &str, encoded: &EncodedShard) -> Result<(), BlobError> {
-        let start = Instant::now();
-        let mut pause = Duration::from_millis(100);
-        loop {
-            match self.blobs.create(object, encoded.content.clone()).await {
-                Ok(()) => return Ok(()),
-                // Nobody else has this name: an earlier try of ours has worked without telling.
-                Err(error) if error.is_already_there() => return Ok(()),
-                Err(error) if start.elapsed() > PATIENCE => return Err(error),
-                Err(error) => tracing::warn!(%error, object, "put failed; trying again"),
-            }
-            tokio::time::sleep(pause).await;
-            pause = (pause * 2).min(Duration::from_secs(5));
-        }
-    }
-
-    async fn commit(&self, claim: &Claim, result: &ShardResult) -> Result<CommitOutcome, LedgerError> {
-        let start = Instant::now();
-        loop {
-            match self.ledger.commit_shard(claim, result).await {
-                Err(error) if error.is_transient() && start.elapsed() < PATIENCE => {
-                    tracing::warn!(%error, "commit failed; trying again");
-                    tokio::time::sleep(LOOK).await;
-                }
-                outcome => return outcome,
-            }
-        }
-    }
-}
-
-/// A worker's time around a shard.
-struct Work {
-    /// Waited for it.
-    wait_s: f64,
-    /// When its object was in the store.
-    ended: Option<Instant>,
 }
 
 enum Simulated {

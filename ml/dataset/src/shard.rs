@@ -167,7 +167,9 @@ impl<W: Write> ShardWriter<W> {
     }
 
     fn flush(&mut self) -> Result<(), ShardError> {
-        let batch = std::mem::replace(&mut self.batch, Batch::new(&self.schema));
+        // The next batch will be as large.
+        let next = Batch::with_capacity(&self.schema, self.batch.rows());
+        let batch = std::mem::replace(&mut self.batch, next);
         self.writer.write(&batch.into_arrow(&self.schema)?)?;
         Ok(())
     }
@@ -239,6 +241,10 @@ enum SampleColumns {
 
 impl Batch {
     fn new(schema: &ShardSchema) -> Self {
+        Self::with_capacity(schema, 0)
+    }
+
+    fn with_capacity(schema: &ShardSchema, rows: usize) -> Self {
         let channels = schema.channels.len();
         Self {
             settling: Vec::new(),
@@ -253,8 +259,12 @@ impl Batch {
             angles: vec![Vec::new(); schema.angles.len()],
             offsets: vec![0],
             samples: match schema.sample_type {
-                SampleType::Float64 => SampleColumns::F64(vec![Vec::new(); channels]),
-                SampleType::Float32 => SampleColumns::F32(vec![Vec::new(); channels]),
+                SampleType::Float64 => {
+                    SampleColumns::F64((0..channels).map(|_| Vec::with_capacity(rows)).collect())
+                }
+                SampleType::Float32 => {
+                    SampleColumns::F32((0..channels).map(|_| Vec::with_capacity(rows)).collect())
+                }
             },
         }
     }

@@ -44,6 +44,7 @@ pub use sweeps::{SweepCellRecord, SweepRecord};
 pub use workers::Beat;
 
 use engine::{Pool, values};
+use std::time::Duration;
 
 /// One script per schema version, in order; a released one never changes.
 const SCHEMA: [&str; 7] = [
@@ -93,6 +94,16 @@ impl Ledger {
     #[must_use]
     pub fn engine(&self) -> Engine {
         self.pool.engine()
+    }
+
+    /// Longest pause of a worker between two looks for work: a file of this machine is asked by a few, a server
+    /// by hundreds.
+    #[must_use]
+    pub fn longest_idle(&self) -> Duration {
+        match self.engine() {
+            Engine::Sqlite => Duration::from_millis(20),
+            Engine::Postgres => Duration::from_millis(100),
+        }
     }
 
     /// Answers if the database does.

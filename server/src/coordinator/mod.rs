@@ -36,6 +36,8 @@ use watch::Watch;
 /// How often the ledger is looked at while a job is unfinished: a few reads of a local file, against
 /// workers that wait for their next shard.
 const BUSY_TICK: Duration = Duration::from_millis(50);
+/// The same while the first runs of a job are measured and its workers may soon have nothing to do.
+const SHORT_TICK: Duration = Duration::from_millis(5);
 /// How often objects are looked for that nothing names: rare, and in nobody's way.
 const SWEEP: Duration = Duration::from_mins(1);
 /// And when there is none; whoever accepts a job calls.
@@ -284,8 +286,9 @@ impl Coordinator {
                 }
             }
             let pause = match self.tick(&mut watch, &mut tasks).await {
-                Ok(true) => BUSY_TICK,
-                Ok(false) => IDLE_TICK,
+                Ok(Need::Shards) => SHORT_TICK,
+                Ok(Need::Care) => BUSY_TICK,
+                Ok(Need::Nothing) => IDLE_TICK,
                 Err(error) => {
                     // The database may be restarting; nothing is lost by looking again.
                     tracing::warn!(%error, "the ledger could not be looked after; trying again");
@@ -314,12 +317,12 @@ impl Coordinator {
         }
     }
 
-    /// One look at everything. True while a job is unfinished.
+    /// One look at everything.
     async fn tick(
         &self,
         watch: &mut Watch,
         tasks: &mut tokio::task::JoinSet<()>,
-    ) -> Result<bool, LedgerError> {
+    ) -> Result<Need, LedgerError> {
         let beats = self.ledger().beats().await?;
         for (worker, reason) in watch.look(Instant::now(), &beats) {
             tracing::warn!(worker, reason, "worker given up");
@@ -328,7 +331,11 @@ impl Coordinator {
         self.ledger().recover_lost("its worker was given up").await?;
         let workers = self.worker_count(&beats);
         let unfinished = self.ledger().unfinished_jobs().await?;
-        let busy = !unfinished.is_empty();
+        let mut need = if unfinished.is_empty() {
+            Need::Nothing
+        } else {
+            Need::Care
+        };
         for job in unfinished {
             if !job.is_complete() && watch.becomes_stranded(&job, &beats) {
                 tracing::warn!(
@@ -339,9 +346,9 @@ impl Coordinator {
                 );
             }
             match job.state {
-                JobState::Queued => self.advance(&job, workers).await?,
+                JobState::Queued => need = need.max(self.advance(&job, workers).await?),
                 JobState::Simulating => {
-                    self.advance(&job, workers).await?;
+                    need = need.max(self.advance(&job, workers).await?);
                     if self.publishes_fewer_than(MOST_EARLY) {
                         self.publish_in_background(job, tasks);
                     }
@@ -359,7 +366,12 @@ impl Coordinator {
                 }
             }
         }
-        Ok(busy)
+        // Without workers nothing is soon done.
+        Ok(if beats.is_empty() {
+            need.min(Need::Care)
+        } else {
+            need
+        })
     }
 
     /// Workers that simulate; the configured number while none has reported.
@@ -372,18 +384,18 @@ impl Coordinator {
     }
 
     /// Plans the next shards of a job, or sees that it is complete.
-    async fn advance(&self, job: &JobRecord, workers: u64) -> Result<(), LedgerError> {
+    async fn advance(&self, job: &JobRecord, workers: u64) -> Result<Need, LedgerError> {
         if job.is_complete() {
             if self.ledger().begin_publishing(job.id).await? {
                 tracing::info!(job = %job.id, "every run is accounted for; publishing");
                 self.wake();
             }
-            return Ok(());
+            return Ok(Need::Care);
         }
         let settling = job.progress.settling_total - job.settling_planned;
         let runs = job.progress.runs_total - job.runs_planned;
         if settling + runs == 0 {
-            return Ok(());
+            return Ok(Need::Care);
         }
         let mut situation = Situation {
             remaining: settling,
@@ -405,8 +417,16 @@ impl Coordinator {
             self.ledger()
                 .plan_shards(job.id, ShardKind::Runs, job.runs_planned, &sizes)
                 .await?;
+            situation.open += sizes.len() as u64;
         }
-        Ok(())
+        let planned: u64 = sizes.iter().sum();
+        // The first shards are there to measure with, and are soon done.
+        let measuring = situation.run_cost_s.is_none() && job.state == JobState::Simulating;
+        Ok(if measuring && planned < runs {
+            Need::Shards
+        } else {
+            Need::Care
+        })
     }
 
     fn publishes_fewer_than(&self, most: usize) -> bool {
@@ -446,6 +466,17 @@ impl Coordinator {
             }
         });
     }
+}
+
+/// What a look has found, least urgent first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Need {
+    /// No job is unfinished.
+    Nothing,
+    /// Jobs are unfinished.
+    Care,
+    /// Workers may soon wait for shards.
+    Shards,
 }
 
 /// Uncompressed size of a run, for at most 32 channels. Only bounds the size of shards.

@@ -6,7 +6,12 @@
 /// vanish beside it, short enough that a lost one is soon done again.
 const SHARD_S: f64 = 1.0;
 
-/// Samples a shard may hold uncompressed: bounds the memory of a worker.
+/// Work that is worth a shard: a smaller one costs more to claim, flush and commit than it does to share
+/// it out.
+const LEAST_S: f64 = 0.1;
+
+/// Samples a shard may hold uncompressed: bounds the memory of a worker, which has one shard in work and one
+/// on its way to the store.
 const SHARD_BYTES: u64 = 64 << 20;
 
 /// Runs of a shard while no run of the job has been measured.
@@ -52,12 +57,19 @@ pub fn shard_sizes(situation: Situation) -> Vec<u64> {
         None => 2 * workers,
         Some(_) => OPEN_PER_WORKER * workers,
     };
+    // What is left evens out over the workers, and where they have other shards not below what is worth one.
+    let least = run_cost_s.map_or(UNMEASURED_RUNS, |cost_s| runs_in(LEAST_S, cost_s));
+    let least = if open < workers {
+        least.min(remaining / workers)
+    } else {
+        least
+    };
     let mut sizes = Vec::new();
     while remaining > 0 && open + (sizes.len() as u64) < limit {
         // Every worker gets at least two more shards out of what is left, so that none idles while
         // another one finishes a long last shard.
         let fair = remaining.div_ceil(2 * workers);
-        let size = most.min(fair).clamp(1, remaining);
+        let size = fair.max(least).min(most).clamp(1, remaining);
         sizes.push(size);
         remaining -= size;
     }
@@ -99,6 +111,26 @@ mod tests {
             );
             assert_eq!(sizes.iter().sum::<u64>().min(80), sizes.iter().sum::<u64>());
         }
+    }
+
+    #[test]
+    fn no_shard_is_too_small_to_be_worth_it() {
+        let mut remaining = 2560;
+        let mut sizes = Vec::new();
+        while remaining > 0 {
+            // Both workers have one when the next round is planned.
+            let open = if sizes.is_empty() { 0 } else { 2 };
+            let next = shard_sizes(Situation {
+                open,
+                ..situation(remaining, 2, Some(6e-4))
+            });
+            remaining -= next.iter().sum::<u64>();
+            sizes.extend(next);
+        }
+        // 166 runs take a tenth of a second; only the very last one may be smaller.
+        let (last, others) = sizes.split_last().unwrap();
+        assert!(others.iter().all(|size| *size >= 166), "{sizes:?}");
+        assert!(*last > 0 && sizes.len() < 12, "{sizes:?}");
     }
 
     #[test]
