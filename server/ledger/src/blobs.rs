@@ -355,7 +355,8 @@ impl Blobs {
         }
     }
 
-    /// Deletes every object below a key; returns how many there were.
+    /// Deletes every object below a key, and what interrupted puts have left there; returns how many objects
+    /// there were.
     ///
     /// # Errors
     /// Passes on what the store says.
@@ -371,11 +372,35 @@ impl Blobs {
             .delete_stream(locations)
             .try_fold(0, |count, _| async move { Ok(count + 1) })
             .await?;
+        self.remove_interrupted_puts(key);
         // Object stores have no directories; a directory's empty ones would stay for ever.
         if let Some(path) = self.local_path(key) {
             let _ = std::fs::remove_dir(path);
         }
         Ok(deleted)
+    }
+
+    /// Removes what puts below a key have left that were interrupted by the death of their process. Whoever is
+    /// putting there at this moment is refused and has to try again. Object stores keep unfinished
+    /// uploads out of sight, and drop them by a rule of the bucket.
+    pub fn remove_interrupted_puts(&self, key: &str) {
+        fn remove(folder: &Path) {
+            for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+                let path = entry.path();
+                match entry.file_type() {
+                    Ok(kind) if kind.is_dir() => remove(&path),
+                    Ok(kind) if kind.is_file() && is_staged(&entry.file_name()) => {
+                        if let Err(error) = std::fs::remove_file(&path) {
+                            tracing::debug!(%error, path = %path.display(), "an interrupted put stays");
+                        }
+                    }
+                    _ => {}
+                }
+            }
+        }
+        if let Some(path) = self.local_path(key) {
+            remove(&path);
+        }
     }
 
     /// Removes the folders of a directory that deleted objects have left empty, and the folder of the key with
@@ -425,6 +450,15 @@ impl Blobs {
         keys.sort();
         Ok(keys)
     }
+}
+
+/// Whether a file is an object that is still being written: `LocalFileSystem` writes to `NAME#NUMBER`, renames
+/// when it is whole, and neither lists such names nor lets them be deleted.
+fn is_staged(name: &std::ffi::OsStr) -> bool {
+    let Some((_, number)) = name.to_str().and_then(|name| name.split_once('#')) else {
+        return false;
+    };
+    !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 /// Moves a file within a file system, and makes its new name durable with every directory made for it.

@@ -69,6 +69,8 @@ impl Orphans {
                 continue;
             }
             if ledger.dataset(&id).await?.is_some() {
+                // Every object of it is there; what is not whole is of an attempt that died.
+                blobs.remove_interrupted_puts(&format!("datasets/{id}"));
                 self.named.insert(id);
                 continue;
             }
@@ -95,7 +97,12 @@ async fn delete_abandoned(ledger: &Ledger, blobs: &Blobs, id: &DatasetId) -> Res
         abandoned.release().await?;
         deleted += 1;
     }
-    blobs.remove_empty_folders(&folder);
+    // With nothing listed nobody was asked yet whether somebody puts there.
+    if let Some(abandoned) = ledger.abandoned(id).await? {
+        blobs.remove_interrupted_puts(&folder);
+        abandoned.release().await?;
+        blobs.remove_empty_folders(&folder);
+    }
     Ok(deleted)
 }
 

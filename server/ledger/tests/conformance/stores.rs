@@ -15,6 +15,7 @@ on_every_store![
     a_large_file_is_uploaded_in_parts,
     a_folder_is_there_to_read_as_files,
     what_is_below_a_key_is_listed_and_deleted_and_nothing_else,
+    a_put_that_was_interrupted_is_seen_by_nobody_and_deleted,
 ];
 
 async fn a_store_that_is_there_answers(blobs: Blobs) {
@@ -155,4 +156,19 @@ async fn what_is_below_a_key_is_listed_and_deleted_and_nothing_else(blobs: Blobs
     assert_eq!(blobs.delete_below("shards/j").await.unwrap(), 0);
     assert_eq!(blobs.list("shards").await.unwrap(), ["shards/jj/a"]);
     assert_eq!(blobs.list("datasets").await.unwrap(), ["datasets/j/a"]);
+}
+
+async fn a_put_that_was_interrupted_is_seen_by_nobody_and_deleted(blobs: Blobs) {
+    let Some(folder) = blobs.local_path("shards/k") else {
+        // An object store shows an object whole or not at all.
+        return;
+    };
+    let key = "shards/k/a.parquet";
+    blobs.create(key, Bytes::from_static(b"whole")).await.unwrap();
+    // What a process leaves that dies while it writes an object.
+    std::fs::write(folder.join("b.parquet#1"), b"ha").unwrap();
+    std::fs::write(folder.join("b.parquet#2"), b"half").unwrap();
+    assert_eq!(blobs.list("shards/k").await.unwrap(), [key]);
+    assert_eq!(blobs.delete_below("shards/k").await.unwrap(), 1);
+    assert!(!folder.exists());
 }

@@ -90,6 +90,13 @@ async fn what_nobody_publishes_is_deleted(ledger: &Ledger, blobs: &Blobs) {
     hasty.sweep(ledger, blobs).await.unwrap();
     assert_eq!(count().await, 2, "the twin is not over");
     ledger.cancel_job(twin).await.unwrap();
+    let folder = blobs.local_path(&format!("datasets/{}", dataset.id));
+    let interrupt = || {
+        if let Some(folder) = &folder {
+            std::fs::write(folder.join("manifest.json#1"), b"half").unwrap();
+        }
+    };
+    interrupt();
     assert!(hasty.sweep(ledger, blobs).await.unwrap() >= 2);
     assert_eq!(count().await, 0);
     assert!(
@@ -105,9 +112,13 @@ async fn what_nobody_publishes_is_deleted(ledger: &Ledger, blobs: &Blobs) {
     finish_runs(ledger, job).await;
     ledger.announce_upload(job, &dataset.id).await.unwrap();
     put().await;
+    interrupt();
     assert!(ledger.publish_dataset(job, &dataset, &[]).await.unwrap());
     hasty.sweep(ledger, blobs).await.unwrap();
     assert_eq!(count().await, 2);
+    if let Some(folder) = &folder {
+        assert!(!folder.join("manifest.json#1").exists());
+    }
     assert!(ledger.abandoned(&dataset.id).await.unwrap().is_none());
 }
 
