@@ -684,7 +684,7 @@ impl Trial {
         let blobs = Blobs::open_with(&self.store, variables)?;
         let start = Instant::now();
         loop {
-            let shards = runtime.block_on(blobs.list("shards"))?;
+            let shards = everything_below(runtime, &blobs, "shards")?;
             if shards.is_empty() {
                 break;
             }
@@ -705,7 +705,7 @@ impl Trial {
             .filter_map(|file| Some(format!("datasets/{id}/{}", file["path"].as_str()?)))
             .collect();
         listed.sort();
-        let stored = runtime.block_on(blobs.list("datasets"))?;
+        let stored = everything_below(runtime, &blobs, "datasets")?;
         ensure!(stored == listed, "stored {stored:?}, listed {listed:?}");
         Ok(())
     }
@@ -790,6 +790,41 @@ impl Tally {
         line("orphans left after collection", &|_| 0);
         line("data sets with another hash than an undisturbed run's", &|_| 0);
         text
+    }
+}
+
+/// What lies below a key, sorted: in a directory every file, also those that its store does not list.
+fn everything_below(
+    runtime: &tokio::runtime::Runtime,
+    blobs: &Blobs,
+    key: &str,
+) -> anyhow::Result<Vec<String>> {
+    fn walk(folder: &Path, key: &str, found: &mut Vec<String>) -> std::io::Result<()> {
+        for entry in std::fs::read_dir(folder)? {
+            let entry = entry?;
+            let key = format!("{key}/{}", entry.file_name().to_string_lossy());
+            if entry.file_type()?.is_dir() {
+                walk(&entry.path(), &key, found)?;
+            } else {
+                found.push(key);
+            }
+        }
+        Ok(())
+    }
+    let Some(folder) = blobs.local_path(key) else {
+        return Ok(runtime.block_on(blobs.list(key))?);
+    };
+    loop {
+        let mut found = Vec::new();
+        match walk(&folder, key, &mut found) {
+            // Something was deleted while it was looked at.
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound && folder.exists() => {}
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error.into()),
+            _ => {
+                found.sort();
+                return Ok(found);
+            }
+        }
     }
 }
 
