@@ -133,7 +133,7 @@ fn scaled(channel: &Channel, offset: f64, scale: f64) -> ScaledChannel {
 }
 
 /// Mean and standard deviation by Welford's update, stable for large offsets.
-fn mean_and_std(values: impl Iterator<Item = f64>) -> (f64, f64) {
+pub(crate) fn mean_and_std(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let (mut count, mut mean, mut squares) = (0.0_f64, 0.0_f64, 0.0_f64);
     for value in values {
         count += 1.0;

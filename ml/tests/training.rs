@@ -439,6 +439,28 @@ fn a_changed_file_is_not_loaded() {
 }
 
 #[test]
+fn a_model_card_shows_how_the_data_lie_and_how_the_network_learned() {
+    let folder = Folder::new("card");
+    run(&spec("RLR", 3), &folder.0, "model").unwrap();
+    let files = folder.files("model");
+    let text = |name: &str| String::from_utf8(files[name].clone()).unwrap();
+    let card = text("README.md");
+    for name in ["distribution.svg", "learning.svg"] {
+        assert!(card.contains(&format!("]({name})")), "{card}");
+        let svg = text(name);
+        assert!(!svg.contains("NaN") && svg.trim_end().ends_with("</svg>"), "{svg}");
+    }
+    // A histogram and its normal distribution for both sensors and the target.
+    let distribution = text("distribution.svg");
+    assert_eq!(distribution.matches("<path").count(), 3);
+    assert_eq!(distribution.matches("<polyline").count(), 3);
+    for name in ["Lift valve", "Tip deflection y"] {
+        assert!(distribution.contains(name), "{name}");
+    }
+    assert_eq!(text("learning.svg").matches("<polyline").count(), 2);
+}
+
+#[test]
 fn a_network_of_several_steps_estimates_the_end_of_its_window() {
     let folder = Folder::new("several");
     let spec = TrainingSpec {

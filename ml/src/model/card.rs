@@ -4,16 +4,27 @@ use crate::evaluate::table::{display_unit, significant};
 use hydroflex_openapi::model::{ModelConfig, TargetMetrics};
 use std::fmt::Write;
 
-/// `README.md` of a model folder.
+/// A picture beside the card.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Name of its file.
+    pub file: &'static str,
+    /// What it shows.
+    pub caption: &'static str,
+    /// The picture.
+    pub svg: String,
+}
+
+/// `README.md` of a model folder with these pictures.
 #[must_use]
-pub fn card(config: &ModelConfig) -> String {
+pub fn card(config: &ModelConfig, pictures: &[Picture]) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    let _ = write_card(&mut text, config);
+    let _ = write_card(&mut text, config, pictures);
     text
 }
 
-fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
+fn write_card(text: &mut String, config: &ModelConfig, pictures: &[Picture]) -> std::fmt::Result {
     let provenance = &config.provenance;
     writeln!(
         text,
@@ -62,6 +73,9 @@ fn write_card(text: &mut String, config: &ModelConfig) -> std::fmt::Result {
         "\nThese runs chose the weights' epoch and the intervals; judge the model on runs that it has never seen \
          (`hydroflex evaluate`).\n"
     )?;
+    for picture in pictures {
+        writeln!(text, "![{}]({})\n", picture.caption, picture.file)?;
+    }
     writeln!(text, "## Origin\n")?;
     writeln!(text, "- data set `{}`", provenance.dataset_sha256)?;
     writeln!(

@@ -7,6 +7,7 @@
 //! | `auxiliary.safetensors` | linear baselines, envelope |
 //! | `model.onnx` | the same network with the scales in its graph |
 //! | `README.md` | model card |
+//! | `distribution.svg`, `learning.svg` | its pictures |
 //! | `SHA256SUMS` | hashes of the others; its own hash names the model |
 
 pub mod write;

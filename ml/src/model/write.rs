@@ -4,6 +4,7 @@ use super::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
+use crate::plot;
 use crate::predict::Predictor;
 use crate::runs::Runs;
 use crate::scheduled::RANGE_FACTOR;
@@ -60,7 +61,19 @@ pub fn write_model(
     config.validation_least_squares = judged.least_squares;
     config.intervals = judged.intervals;
     config.golden = golden(problem, &predictor);
-    write_parts(&config, &weights, &auxiliary, out_dir)?;
+    let pictures = [
+        card::Picture {
+            file: "distribution.svg",
+            caption: "Distribution of the training data, scaled as the network sees them",
+            svg: plot::distribution::of_problem(problem),
+        },
+        card::Picture {
+            file: "learning.svg",
+            caption: "Learning curve",
+            svg: plot::profile::of_learning(&config),
+        },
+    ];
+    write_parts(&config, &weights, &auxiliary, &pictures, out_dir)?;
     let model = Model::load(out_dir)?;
     Ok(summary(&model, problem, outcome))
 }
@@ -73,14 +86,15 @@ pub(crate) fn write_parts(
     config: &ModelConfig,
     weights: &Weights,
     auxiliary: &Auxiliary,
+    pictures: &[card::Picture],
     out_dir: &Path,
 ) -> Result<(), ModelError> {
     let tensors = |source| ModelError::Tensors {
         path: out_dir.to_owned(),
         source,
     };
-    let files = [
-        ("README.md", card::card(config).into_bytes()),
+    let mut files = vec![
+        ("README.md", card::card(config, pictures).into_bytes()),
         ("auxiliary.safetensors", auxiliary.to_file().map_err(tensors)?),
         ("config.json", to_json(config)),
         ("model.onnx", super::onnx::to_onnx(config, weights)),
@@ -89,6 +103,11 @@ pub(crate) fn write_parts(
             weights.to_file(&config.layers).map_err(tensors)?,
         ),
     ];
+    files.extend(
+        pictures
+            .iter()
+            .map(|picture| (picture.file, picture.svg.clone().into_bytes())),
+    );
     write_folder(out_dir, &files)
 }
 

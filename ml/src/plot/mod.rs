@@ -3,6 +3,7 @@
 //! SVG written directly: a few hundred elements, no fonts to ship, sharp at any size.
 
 pub mod axis;
+pub mod distribution;
 pub mod errors;
 pub mod profile;
 

@@ -5,6 +5,7 @@ use crate::evaluate::Evaluation;
 use crate::evaluate::profile::{ProfilePoint, profile};
 use crate::evaluate::table::display_unit;
 use crate::model::Model;
+use hydroflex_openapi::model::{EpochRecord, ModelConfig};
 use std::fmt::Write as _;
 
 const LEFT: f64 = 84.0;
@@ -63,11 +64,6 @@ pub fn of_target(model: &Model, evaluation: &Evaluation, target: usize, title: &
                 .collect(),
         },
     );
-    let history = &config.provenance.history;
-    let learned = |color, value: fn(&hydroflex_openapi::model::EpochRecord) -> f64| Curve {
-        color,
-        points: history.iter().map(|h| (h.epoch as f64, value(h))).collect(),
-    };
     let panels = [
         Panel {
             title: "Mean absolute error over time".to_owned(),
@@ -90,16 +86,7 @@ pub fn of_target(model: &Model, evaluation: &Evaluation, target: usize, title: &
             log: true,
             curves: over_frequency,
         },
-        Panel {
-            title: "Learning curve: loss in training (grey) and validation".to_owned(),
-            x: "Epoch".to_owned(),
-            y: "loss".to_owned(),
-            log: false,
-            curves: vec![
-                learned(REFERENCE, |h| h.train_loss),
-                learned(ESTIMATE, |h| h.validation_loss),
-            ],
-        },
+        learning_panel(&config.provenance.history),
     ];
     let subtitle = format!(
         "{}, {} runs that were not trained on; {} network on {} samples of {} sensors",
@@ -115,18 +102,62 @@ pub fn of_target(model: &Model, evaluation: &Evaluation, target: usize, title: &
     svg
 }
 
+/// The picture of how a model learned.
+#[must_use]
+pub fn of_learning(config: &ModelConfig) -> String {
+    let provenance = &config.provenance;
+    let title = "Learning curve";
+    let subtitle = format!(
+        "{} network on {} samples of {} sensors, {} windows in an epoch; weights of epoch {}",
+        config.structure,
+        config.window_steps,
+        config.inputs.len(),
+        provenance.train_windows,
+        provenance.best_epoch
+    );
+    let mut svg = String::new();
+    // Writing to a String cannot fail.
+    let _ = draw(&mut svg, title, &subtitle, &[learning_panel(&provenance.history)]);
+    svg
+}
+
+fn learning_panel(history: &[EpochRecord]) -> Panel {
+    let curve = |color, value: fn(&EpochRecord) -> f64| Curve {
+        color,
+        points: history.iter().map(|h| (h.epoch as f64, value(h))).collect(),
+    };
+    Panel {
+        title: "Learning curve: loss in training (grey) and validation".to_owned(),
+        x: "Epoch".to_owned(),
+        y: "loss".to_owned(),
+        log: false,
+        curves: vec![
+            curve(REFERENCE, |h| h.train_loss),
+            curve(ESTIMATE, |h| h.validation_loss),
+        ],
+    }
+}
+
 fn draw(svg: &mut String, title: &str, subtitle: &str, panels: &[Panel]) -> std::fmt::Result {
     let rows = panels.len().div_ceil(2) as f64;
     open_svg(svg, TOP + rows * (PANEL + ROW_GAP) - 20.0, title)?;
     writeln!(
         svg,
         "<text x=\"24\" y=\"34\" font-size=\"20\" font-weight=\"600\">{}</text>\
-         <text x=\"24\" y=\"56\" fill=\"{QUIET}\">{}</text>\
-         <text x=\"24\" y=\"76\" font-size=\"12\"><tspan fill=\"{ESTIMATE}\" font-weight=\"600\">network</tspan> · \
-         <tspan fill=\"#a96f00\">least squares on the same window</tspan></text>",
+         <text x=\"24\" y=\"56\" fill=\"{QUIET}\">{}</text>",
         escape(title),
         escape(subtitle)
     )?;
+    if panels
+        .iter()
+        .any(|panel| panel.curves.iter().any(|curve| curve.color == BASELINE))
+    {
+        writeln!(
+            svg,
+            "<text x=\"24\" y=\"76\" font-size=\"12\"><tspan fill=\"{ESTIMATE}\" font-weight=\"600\">network</tspan> · \
+             <tspan fill=\"#a96f00\">least squares on the same window</tspan></text>"
+        )?;
+    }
     let width = (WIDTH - LEFT - GAP - RIGHT) / 2.0;
     for (index, panel) in panels.iter().enumerate() {
         let left = LEFT + (index % 2) as f64 * (width + GAP);

@@ -121,7 +121,7 @@ impl SyntheticModel {
     /// # Errors
     /// A file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
-        write::write_parts(&self.config, &self.weights, &self.auxiliary, folder)
+        write::write_parts(&self.config, &self.weights, &self.auxiliary, &[], folder)
     }
 }
 
