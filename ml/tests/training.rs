@@ -448,7 +448,10 @@ fn a_model_card_shows_how_the_data_lie_and_how_the_network_learned() {
     for name in ["distribution.svg", "learning.svg"] {
         assert!(card.contains(&format!("]({name})")), "{card}");
         let svg = text(name);
-        assert!(!svg.contains("NaN") && svg.trim_end().ends_with("</svg>"), "{svg}");
+        assert!(
+            !svg.contains("NaN") && svg.trim_end().ends_with("</svg>"),
+            "{svg}"
+        );
     }
     // A histogram and its normal distribution for both sensors and the target.
     let distribution = text("distribution.svg");

@@ -5,6 +5,7 @@
 pub mod axis;
 pub mod distribution;
 pub mod errors;
+pub mod panels;
 pub mod profile;
 
 use crate::evaluate::table::{display_unit, significant};

@@ -1,35 +1,12 @@
 //! Where a model's errors stand, and how it learned: four panels on logarithmic axes.
 
-use super::{BASELINE, ESTIMATE, GRID, QUIET, REFERENCE, WIDTH, escape, open_svg, readable};
+use super::panels::{Curve, Panel, picture};
+use super::{BASELINE, ESTIMATE, REFERENCE, readable};
 use crate::evaluate::Evaluation;
 use crate::evaluate::profile::{ProfilePoint, profile};
 use crate::evaluate::table::display_unit;
 use crate::model::Model;
 use hydroflex_openapi::model::{EpochRecord, ModelConfig};
-use std::fmt::Write as _;
-
-const LEFT: f64 = 84.0;
-const GAP: f64 = 84.0;
-const RIGHT: f64 = 24.0;
-const TOP: f64 = 104.0;
-const PANEL: f64 = 190.0;
-const ROW_GAP: f64 = 92.0;
-
-/// A curve: colour and points.
-struct Curve {
-    color: &'static str,
-    points: Vec<(f64, f64)>,
-}
-
-/// A panel.
-struct Panel {
-    title: String,
-    x: String,
-    y: String,
-    /// Whether the abscissa is logarithmic; the ordinate is.
-    log: bool,
-    curves: Vec<Curve>,
-}
 
 /// The picture of one target of an evaluation, with the learning curve of the model.
 #[must_use]
@@ -96,10 +73,11 @@ pub fn of_target(model: &Model, evaluation: &Evaluation, target: usize, title: &
         config.window_steps,
         config.inputs.len()
     );
-    let mut svg = String::new();
-    // Writing to a String cannot fail.
-    let _ = draw(&mut svg, title, &subtitle, &panels);
-    svg
+    let legend = [
+        (ESTIMATE, "network".to_owned()),
+        (BASELINE, "least squares on the same window".to_owned()),
+    ];
+    picture(title, &subtitle, &legend, &panels)
 }
 
 /// The picture of how a model learned.
@@ -115,10 +93,7 @@ pub fn of_learning(config: &ModelConfig) -> String {
         provenance.train_windows,
         provenance.best_epoch
     );
-    let mut svg = String::new();
-    // Writing to a String cannot fail.
-    let _ = draw(&mut svg, title, &subtitle, &[learning_panel(&provenance.history)]);
-    svg
+    picture(title, &subtitle, &[], &[learning_panel(&provenance.history)])
 }
 
 fn learning_panel(history: &[EpochRecord]) -> Panel {
@@ -135,167 +110,5 @@ fn learning_panel(history: &[EpochRecord]) -> Panel {
             curve(REFERENCE, |h| h.train_loss),
             curve(ESTIMATE, |h| h.validation_loss),
         ],
-    }
-}
-
-fn draw(svg: &mut String, title: &str, subtitle: &str, panels: &[Panel]) -> std::fmt::Result {
-    let rows = panels.len().div_ceil(2) as f64;
-    open_svg(svg, TOP + rows * (PANEL + ROW_GAP) - 20.0, title)?;
-    writeln!(
-        svg,
-        "<text x=\"24\" y=\"34\" font-size=\"20\" font-weight=\"600\">{}</text>\
-         <text x=\"24\" y=\"56\" fill=\"{QUIET}\">{}</text>",
-        escape(title),
-        escape(subtitle)
-    )?;
-    if panels
-        .iter()
-        .any(|panel| panel.curves.iter().any(|curve| curve.color == BASELINE))
-    {
-        writeln!(
-            svg,
-            "<text x=\"24\" y=\"76\" font-size=\"12\"><tspan fill=\"{ESTIMATE}\" font-weight=\"600\">network</tspan> · \
-             <tspan fill=\"#a96f00\">least squares on the same window</tspan></text>"
-        )?;
-    }
-    let width = (WIDTH - LEFT - GAP - RIGHT) / 2.0;
-    for (index, panel) in panels.iter().enumerate() {
-        let left = LEFT + (index % 2) as f64 * (width + GAP);
-        let top = TOP + (index / 2) as f64 * (PANEL + ROW_GAP);
-        panel.draw(svg, left, top, width)?;
-    }
-    writeln!(svg, "</svg>")
-}
-
-impl Panel {
-    fn draw(&self, svg: &mut String, left: f64, top: f64, width: f64) -> std::fmt::Result {
-        writeln!(
-            svg,
-            "<text x=\"{left:.1}\" y=\"{:.1}\" font-weight=\"600\" font-size=\"12\">{}</text>\
-             <rect x=\"{left:.1}\" y=\"{top:.1}\" width=\"{width:.1}\" height=\"{PANEL}\" fill=\"none\" stroke=\"#cbd2d9\"/>\
-             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\" font-size=\"12\">{}</text>",
-            top - 8.0,
-            escape(&self.title),
-            left + width / 2.0,
-            top + PANEL + 36.0,
-            escape(&self.x)
-        )?;
-        let points = || {
-            let all = self.curves.iter().flat_map(|curve| &curve.points);
-            all.copied().filter(|(x, y)| *y > 0.0 && (!self.log || *x > 0.0))
-        };
-        let across = |x: f64| if self.log { x.log10() } else { x };
-        let (mut x_min, mut x_max) = (f64::INFINITY, f64::NEG_INFINITY);
-        let (mut y_min, mut y_max) = (f64::INFINITY, f64::NEG_INFINITY);
-        for (x, y) in points() {
-            x_min = x_min.min(across(x));
-            x_max = x_max.max(across(x));
-            y_min = y_min.min(y.log10());
-            y_max = y_max.max(y.log10());
-        }
-        if x_min > x_max {
-            return writeln!(
-                svg,
-                "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{QUIET}\">nothing to show</text>",
-                left + width / 2.0,
-                top + PANEL / 2.0
-            );
-        }
-        let (y_low, y_high) = (y_min.floor(), y_max.ceil().max(y_min.floor() + 1.0));
-        let x_span = (x_max - x_min).max(1e-12);
-        let px = |x: f64| left + (across(x) - x_min) / x_span * width;
-        let py = |y: f64| top + PANEL - (y.log10() - y_low) / (y_high - y_low) * PANEL;
-        let mut power = y_low;
-        while power <= y_high {
-            let y = py(10f64.powf(power));
-            writeln!(
-                svg,
-                "<line x1=\"{left:.1}\" x2=\"{:.1}\" y1=\"{y:.1}\" y2=\"{y:.1}\" stroke=\"{GRID}\"/>\
-                 <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\" font-size=\"11\" fill=\"{QUIET}\">1e{power:.0}</text>",
-                left + width,
-                left - 6.0,
-                y + 4.0
-            )?;
-            power += 1.0;
-        }
-        for tick in self.ticks(x_min, x_max) {
-            let x = px(tick);
-            writeln!(
-                svg,
-                "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{top:.1}\" y2=\"{:.1}\" stroke=\"{GRID}\"/>\
-                 <text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" font-size=\"11\" fill=\"{QUIET}\">{}</text>",
-                top + PANEL,
-                top + PANEL + 16.0,
-                crate::evaluate::table::significant(tick)
-                    .trim_end_matches(".00")
-                    .to_owned()
-            )?;
-        }
-        let middle = top + PANEL / 2.0;
-        let at = left - 52.0;
-        writeln!(
-            svg,
-            "<text x=\"{at:.1}\" y=\"{middle:.1}\" text-anchor=\"middle\" font-size=\"11\" fill=\"{QUIET}\" \
-             transform=\"rotate(-90 {at:.1} {middle:.1})\">{}</text>",
-            escape(&self.y)
-        )?;
-        for curve in &self.curves {
-            write!(
-                svg,
-                "<polyline fill=\"none\" stroke=\"{}\" stroke-width=\"1.8\" stroke-linejoin=\"round\" points=\"",
-                curve.color
-            )?;
-            for &(x, y) in &curve.points {
-                if y > 0.0 && (!self.log || x > 0.0) {
-                    write!(svg, "{:.1},{:.1} ", px(x), py(y))?;
-                }
-            }
-            writeln!(svg, "\"/>")?;
-        }
-        Ok(())
-    }
-
-    /// Round values of the abscissa.
-    fn ticks(&self, min: f64, max: f64) -> Vec<f64> {
-        if self.log {
-            #[allow(clippy::cast_possible_truncation, reason = "a handful of powers of ten")]
-            let powers = min.ceil() as i32..=max.floor() as i32;
-            return powers.map(|power| 10f64.powi(power)).collect();
-        }
-        super::axis::Axis {
-            min,
-            max: max.max(min + 1e-12),
-            start_px: 0.0,
-            end_px: 1.0,
-        }
-        .ticks(6)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn panels_are_drawn_whole_with_values_that_have_no_logarithm_left_out() {
-        let panel = |log| Panel {
-            title: "A < B".to_owned(),
-            x: "x".to_owned(),
-            y: "mm".to_owned(),
-            log,
-            curves: vec![Curve {
-                color: ESTIMATE,
-                points: vec![(0.0, 0.1), (1.0, 0.0), (10.0, 0.01), (100.0, 0.2)],
-            }],
-        };
-        let empty = Panel {
-            curves: Vec::new(),
-            ..panel(false)
-        };
-        let mut svg = String::new();
-        draw(&mut svg, "T & U", "", &[panel(false), panel(true), empty]).unwrap();
-        assert!(svg.contains("T &amp; U") && svg.contains("A &lt; B") && svg.trim_end().ends_with("</svg>"));
-        assert_eq!(svg.matches("<polyline").count(), 2);
-        assert!(svg.contains("nothing to show") && !svg.contains("NaN") && !svg.contains("inf"));
     }
 }

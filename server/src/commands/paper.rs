@@ -5,6 +5,7 @@
 //! also networks for payloads that they are not told. Everything lies below one
 //! directory; what is there already is not made again, so a study that was stopped goes on.
 
+mod by_runs;
 mod cells;
 mod choices;
 mod report;
@@ -42,9 +43,10 @@ pub struct Args {
     /// Payloads in kg, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "0,50,100")]
     pub payloads: Vec<f64>,
-    /// Runs for training; a quarter as many more validate
-    #[arg(long, default_value_t = 256)]
-    pub runs: u64,
+    /// Runs for training, a quarter as many more validate; several numbers, separated by commas, show what more
+    /// data are worth
+    #[arg(long, value_delimiter = ',', default_value = "256")]
+    pub runs: Vec<u64>,
     /// Sensor sets, separated by commas
     #[arg(long, value_parser = choices::sensor_set(), value_delimiter = ',', default_value = "all,usp,us")]
     pub sensors: Vec<SensorSet>,
@@ -104,7 +106,9 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     if args.short {
         shorten(&mut args);
     }
-    ensure!(args.runs >= 8, "--runs is {}, allowed is 8 or more", args.runs);
+    for runs in &args.runs {
+        ensure!(*runs >= 8, "--runs has {runs}, allowed is 8 or more");
+    }
     ensure!(
         (0.0..1.0).contains(&args.mixed_empty),
         "--mixed-empty is {}, allowed is 0 or more, below 1",
@@ -128,7 +132,8 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     }
     let sets = payloads
         .into_iter()
-        .map(|payload| Sets::make(&args, &simulator, payload))
+        .flat_map(|payload| args.runs.iter().map(move |&runs| (payload, runs)))
+        .map(|(payload, runs)| Sets::make(&args, &simulator, payload, runs))
         .collect::<anyhow::Result<Vec<_>>>()?;
     let mut cells = Vec::new();
     for trained in &sets {
@@ -160,6 +165,11 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
     let picture = args.out.join("report.svg");
     std::fs::write(&picture, report::picture(&cells).to_svg())
         .with_context(|| format!("cannot write {}", picture.display()))?;
+    if args.runs.len() > 1 {
+        let picture = args.out.join("report-runs.svg");
+        std::fs::write(&picture, by_runs::picture(&cells))
+            .with_context(|| format!("cannot write {}", picture.display()))?;
+    }
     if args.json {
         return print_json(&cells);
     }
@@ -174,6 +184,6 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
 fn shorten(args: &mut Args) {
     args.payloads.truncate(1);
     args.seeds = 1;
-    args.runs = args.runs.min(64);
+    args.runs = vec![args.runs.iter().copied().fold(64, u64::min)];
     args.time_limit_s = args.time_limit_s.or(Some(10.0));
 }

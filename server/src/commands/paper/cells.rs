@@ -36,6 +36,9 @@ pub(super) struct Cell {
     pub(super) signals: u64,
     /// Of the training runs.
     pub(super) trained: Payload,
+    /// Training runs, where the study has several numbers of them.
+    #[serde(default)]
+    pub(super) runs: Option<u64>,
     pub(super) sensors: SensorSet,
     pub(super) structure: String,
     #[serde(default)]
@@ -113,7 +116,13 @@ impl Study<'_> {
             recipe,
             noise,
             spec,
-            name: name_of_files(sensors, structure, recipe, noise, seed),
+            name: match self.trained.runs {
+                None => name_of_files(sensors, structure, recipe, noise, seed),
+                Some(runs) => format!(
+                    "{}-{runs}-runs",
+                    name_of_files(sensors, structure, recipe, noise, seed)
+                ),
+            },
         };
         if Structure::is_comparison(structure) {
             self.of_comparison(&asked)
@@ -165,6 +174,7 @@ impl Study<'_> {
                 payload_kg,
                 signals: self.args.signals,
                 trained: self.trained.payload,
+                runs: self.trained.runs,
                 sensors: asked.sensors,
                 structure: spec.structure.clone(),
                 recipe: asked.recipe,
@@ -210,6 +220,7 @@ impl Study<'_> {
                 payload_kg,
                 signals: self.args.signals,
                 trained: self.trained.payload,
+                runs: self.trained.runs,
                 sensors: asked.sensors,
                 structure: spec.structure.clone(),
                 recipe: asked.recipe,
@@ -288,8 +299,10 @@ impl Study<'_> {
     /// The evaluation sets of the payloads that the trained network is for.
     fn evaluated(&self) -> Vec<(f64, &Dataset)> {
         let payload = self.trained.payload;
+        // The same for every number of training runs.
         self.sets
             .iter()
+            .filter(|set| set.runs == self.trained.runs)
             .filter_map(|set| match (set.payload, &set.evaluation) {
                 (Payload::Fixed(kg), Some(evaluation)) => Some((kg, evaluation)),
                 _ => None,
@@ -307,7 +320,7 @@ impl Study<'_> {
             return Ok(Vec::new());
         };
         let mut parts = Vec::new();
-        for set in self.sets {
+        for set in self.sets.iter().filter(|set| set.runs == self.trained.runs) {
             if let (Payload::Fixed(kg), Some(evaluation)) = (set.payload, &set.evaluation)
                 && kg.to_bits() != own.to_bits()
             {

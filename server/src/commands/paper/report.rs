@@ -16,7 +16,7 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
          the evaluation signals was seen: the published 10 s cycle, and the first {} random 10 s runs that stay \
          within stroke and pressures.\n",
         args.integrator,
-        args.runs,
+        several(&args.runs),
         args.seeds,
         if args.seeds == 1 { "" } else { "s" },
         args.signals,
@@ -41,6 +41,9 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
             }
         }
     }
+    if args.runs.len() > 1 {
+        super::by_runs::tables(&mut text, cells);
+    }
     intervals(&mut text, cells);
     envelope(&mut text, cells);
     text.push_str("\n## Published, for comparison\n\nMAE of the vertical deflection over the published cycle, recovered from the plotted curves of Khadim et al. (arXiv 2503.07528), in mm:\n\n");
@@ -53,6 +56,15 @@ pub(super) fn markdown(args: &Args, machine: &str, cells: &[Cell]) -> String {
         );
     }
     text
+}
+
+/// `80, 160 or 320`.
+fn several(numbers: &[u64]) -> String {
+    let names: Vec<String> = numbers.iter().map(u64::to_string).collect();
+    match names.split_last() {
+        Some((last, first)) if !first.is_empty() => format!("{} or {last}", first.join(", ")),
+        _ => names.concat(),
+    }
 }
 
 fn percent(value: f64) -> String {
@@ -198,7 +210,7 @@ fn envelope(text: &mut String, cells: &[Cell]) {
 }
 
 /// `100 kg | U s | best, crane noise`; a network that is not told the payload says so.
-fn label(cell: &Cell) -> String {
+pub(super) fn label(cell: &Cell) -> String {
     let trained = match cell.trained {
         Payload::Fixed(_) => String::new(),
         Payload::Range { min, max } => format!(", payload unknown in {min}–{max} kg"),
@@ -211,8 +223,11 @@ fn label(cell: &Cell) -> String {
         NoiseChoice::None => "",
         NoiseChoice::Crane => ", crane noise",
     };
+    let runs = cell
+        .runs
+        .map_or_else(String::new, |runs| format!(", {runs} runs"));
     format!(
-        "{} kg | {} | {}{recipe}{trained}{noise}",
+        "{} kg | {} | {}{recipe}{trained}{noise}{runs}",
         cell.payload_kg,
         cell.sensors.label(),
         cell.structure
@@ -237,7 +252,10 @@ pub(super) fn picture(cells: &[Cell]) -> ErrorPicture {
         } else {
             ""
         };
-        let name = format!("{} kg, {}{noise}", head.payload_kg, head.sensors.label());
+        let runs = head
+            .runs
+            .map_or_else(String::new, |runs| format!(", {runs} runs"));
+        let name = format!("{} kg, {}{noise}{runs}", head.payload_kg, head.sensors.label());
         if panels.iter().all(|panel| panel.name != name) {
             let mut rows = Vec::new();
             for baseline in &head.cycle.baselines {
@@ -322,7 +340,7 @@ pub(super) fn line(cell: &Cell) -> String {
     text
 }
 
-fn display(metrics: &TargetMetrics) -> (f64, &str) {
+pub(super) fn display(metrics: &TargetMetrics) -> (f64, &str) {
     display_unit(&metrics.target).map_or((1.0, metrics.unit.as_str()), |u| (u.factor, u.label))
 }
 
@@ -334,12 +352,13 @@ fn same(a: &Cell, b: &Cell) -> bool {
 fn same_data(a: &Cell, b: &Cell) -> bool {
     a.payload_kg.to_bits() == b.payload_kg.to_bits()
         && a.trained == b.trained
+        && a.runs == b.runs
         && a.sensors == b.sensors
         && a.noise == b.noise
 }
 
 /// Cells that differ in the seed alone; they stand side by side.
-fn groups(cells: &[Cell]) -> impl Iterator<Item = &[Cell]> {
+pub(super) fn groups(cells: &[Cell]) -> impl Iterator<Item = &[Cell]> {
     cells.chunk_by(same)
 }
 
@@ -357,7 +376,7 @@ fn average(group: &[Cell], value: impl Fn(&Cell) -> f64) -> String {
 }
 
 /// Mean over the seeds; with the range of the seeds where there are several.
-fn mean(group: &[Cell], value: impl Fn(&Cell) -> f64) -> String {
+pub(super) fn mean(group: &[Cell], value: impl Fn(&Cell) -> f64) -> String {
     let values: Vec<f64> = group.iter().map(value).collect();
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     let low = values.iter().copied().fold(f64::INFINITY, f64::min);

@@ -60,9 +60,11 @@ impl Payload {
     }
 }
 
-/// Data sets of one payload.
+/// Data sets of one payload and one number of training runs.
 pub(super) struct Sets {
     pub(super) payload: Payload,
+    /// Training runs, where the study has several numbers of them.
+    pub(super) runs: Option<u64>,
     pub(super) folder: PathBuf,
     pub(super) training: Dataset,
     pub(super) calibration: Runs,
@@ -72,12 +74,19 @@ pub(super) struct Sets {
 
 impl Sets {
     /// Makes what is not there yet.
-    pub(super) fn make(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow::Result<Self> {
+    pub(super) fn make(
+        args: &Args,
+        simulator: &Simulator,
+        payload: Payload,
+        runs: u64,
+    ) -> anyhow::Result<Self> {
+        let one_of_several = (args.runs.len() > 1).then_some(runs);
         let machine = simulator.machine();
         let folder = args.out.join(payload.name());
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
         let set = |name: &str, runs| data_set(args, machine, &folder, name, runs);
-        let training = set("training", training_runs(args, simulator, payload)?)?;
+        let name = one_of_several.map_or_else(|| "training".to_owned(), |runs| format!("training-{runs}"));
+        let training = set(&name, training_runs(args, simulator, payload, runs)?)?;
         let spec = job(
             args,
             payload,
@@ -92,6 +101,7 @@ impl Sets {
         };
         Ok(Self {
             payload,
+            runs: one_of_several,
             training,
             calibration: calm_runs(&calibration)?,
             evaluation,
@@ -111,10 +121,15 @@ fn job(args: &Args, payload: Payload, runs: u64, duration_s: f64, seed: u64) -> 
 }
 
 /// Random runs of 1 s: four fifths train, one fifth validates.
-fn training_runs(args: &Args, simulator: &Simulator, payload: Payload) -> anyhow::Result<Vec<RunInput>> {
+fn training_runs(
+    args: &Args,
+    simulator: &Simulator,
+    payload: Payload,
+    runs: u64,
+) -> anyhow::Result<Vec<RunInput>> {
     let runs = match payload {
-        Payload::Fixed(_) => args.runs,
-        Payload::Range { .. } => args.runs * args.payloads.len() as u64,
+        Payload::Fixed(_) => runs,
+        Payload::Range { .. } => runs * args.payloads.len() as u64,
     };
     let spec = job(args, payload, runs + runs.div_ceil(4), 1.0, 0)?;
     planned(args, simulator, payload, &spec)
