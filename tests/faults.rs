@@ -413,7 +413,8 @@ fn job_with_training() -> serde_json::Value {
         "structure": "RLR",
         "window": { "rule": "given", "window_s": 0.1 },
         "targets": ["deflection_tip_y_m"],
-        "epochs": 400,
+        // Seconds of work also on a fast machine: progress is told a few times a second.
+        "epochs": 2500,
         "windows": "overlapping",
     }]);
     job
@@ -534,7 +535,7 @@ fn a_killed_trainer_goes_on_and_ends_with_the_same_model() {
     );
     signal(service.wait_for_children("train", 1).unwrap()[0], Signal::SIGKILL).unwrap();
     // And once more, with everything else.
-    let status = service.wait_for(&id, |s| finished(s) || epoch(s) > 250).unwrap();
+    let status = service.wait_for(&id, |s| finished(s) || epoch(s) > 600).unwrap();
     assert!(!finished(&status), "{status:?}");
     service.kill().unwrap();
     let service = ServiceUnderTest::start(folder.path(), &workers(1)).unwrap();

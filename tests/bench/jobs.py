@@ -194,28 +194,33 @@ def main():
             data = folder / f"data-{runs}"
             subprocess.run([binary, "dataset", "fetch", status["dataset_id"], "--url", service.url, "--out", data], check=True, stdout=subprocess.DEVNULL)
             tables = run_tables(data, folder, 2)
-            ratios, ours, theirs = [], [], []
+            ratios, ours, theirs, wholes = [], [], [], []
             for turn in range(arguments.rounds):
                 seconds, status = service.job({**spec, "runs": runs, "seed": turn + 1})
                 ours.append(seconds)
                 whole = side_by_side(binary, tables, folder / f"alone-{runs}-{turn}")
+                wholes.append(whole)
                 theirs.append(whole - side_by_side(binary, few(tables), folder / f"few-{runs}-{turn}"))
                 ratios.append(ours[-1] / theirs[-1])
                 spent_rows.append((runs, status["progress"]["spent"]))
-            lines.append((runs, statistics.median(ours), statistics.median(theirs), statistics.median(ratios), min(ratios), max(ratios)))
+            literal = statistics.median(our / whole for our, whole in zip(ours, wholes))
+            lines.append(
+                (runs, statistics.median(ours), statistics.median(wholes), literal, statistics.median(theirs), statistics.median(ratios), min(ratios), max(ratios))
+            )
             print(lines[-1], flush=True)
         size = sizes(folder / f"data-{arguments.runs[0]}")
         service.stop()
     text = ["# What a job costs beside the simulation", ""]
-    text += ["Runs of 1 s of the built-in boom with 1 to 100 kg, 201 rows of all channels in float64, by `tests/bench/jobs.py`: two workers", "of a service, from the request to the published data set, against two `hydroflex simulate --threads 1` processes with half of the", "runs each, side by side, less what two such processes take for two runs each (the mesh is reduced, which the service", "has done before). Medians; the rounds of both take turns. Load average at the end: " + f"{os.getloadavg()[0]:.0f}.", ""]
-    text += ["| runs | service, 2 workers | 2 processes | ratio | lowest | highest |", "|---:|---:|---:|---:|---:|---:|"]
-    for runs, ours, theirs, ratio, low, high in lines:
-        text.append(f"| {runs} | {ours:.2f} s | {theirs:.2f} s | {ratio:.2f} | {low:.2f} | {high:.2f} |")
+    text += ["Runs of 1 s of the built-in boom with 1 to 100 kg, 201 rows of all channels in float64, by `tests/bench/jobs.py`: two workers", "of a service, from the request to the published data set, against two `hydroflex simulate --threads 1` processes with half of the", "runs each, side by side. Each process reduces the mesh first, which the service has done before; the ratio is given with that and", "without it (less what two such processes take for two runs each). Medians; the rounds of both take turns. Load average at the", "end: " + f"{os.getloadavg()[0]:.0f}.", ""]
+    text += ["| runs | service, 2 workers | rows per second | 2 processes | ratio | without reduction | ratio | lowest | highest |", "|---:|---:|---:|---:|---:|---:|---:|---:|---:|"]
+    for runs, ours, whole, literal, theirs, ratio, low, high in lines:
+        rate = runs * 201 / ours
+        text.append(f"| {runs} | {ours:.2f} s | {rate:,.0f} | {whole:.2f} s | {literal:.2f} | {theirs:.2f} s | {ratio:.2f} | {low:.2f} | {high:.2f} |")
     text += ["", "What a worker's time goes into, per run (medians over the rounds):", "", "| runs | simulate | encode | put | wait |", "|---:|---:|---:|---:|---:|"]
     for runs in arguments.runs:
         of = lambda key: statistics.median(spent[key] / n for n, spent in spent_rows if n == runs) * 1e3
         text.append(f"| {runs} | {of('simulate_s'):.3f} ms | {of('encode_s'):.3f} ms | {of('put_s'):.3f} ms | {of('wait_s'):.3f} ms |")
-    text += ["", f"On disk a float64 sample takes {size['parquet']:.2f} bytes in the published Parquet files ({size['channels']} channels), {size['pickle']:.2f} in a pickle of", "NumPy arrays as the published scripts keep them.", ""]
+    text += ["", f"On disk a float64 sample takes {size['parquet']:.2f} bytes in the published Parquet files ({size['channels']} channels), {size['pickle']:.2f} in a pickle of", f"NumPy arrays as the published scripts keep them, which writes {size['pickle_rows_per_s']:,.0f} rows per second of samples that are in memory already.", ""]
     if arguments.huge:
         with tempfile.TemporaryDirectory() as folder:
             # Few columns write little; how many runs a shard has does not depend on them.
