@@ -76,18 +76,9 @@ pub(super) fn picture(cells: &[Cell]) -> String {
             (payload.to_owned(), network.replace(" |", ","), sizes)
         })
         .collect();
-    let distinct = |of: fn(&(String, String, Vec<&[Cell]>)) -> &String| {
-        let mut names: Vec<String> = Vec::new();
-        for name in series.iter().map(of) {
-            if !names.contains(name) {
-                names.push(name.clone());
-            }
-        }
-        names
-    };
-    let networks = distinct(|(_, network, _)| network);
+    let networks = distinct(series.iter().map(|(_, network, _)| network));
     let color = |network: &String| {
-        let position = networks.iter().position(|known| known == network).unwrap_or(0);
+        let position = networks.iter().position(|known| *known == network).unwrap_or(0);
         COLORS[position % COLORS.len()]
     };
     let panel = |payload: &String, signals: &str, error: fn(&Cell) -> f64| Panel {
@@ -110,7 +101,7 @@ pub(super) fn picture(cells: &[Cell]) -> String {
             })
             .collect(),
     };
-    let both: Vec<Panel> = distinct(|(payload, _, _)| payload)
+    let both: Vec<Panel> = distinct(series.iter().map(|(payload, _, _)| payload))
         .iter()
         .flat_map(|payload| {
             [
@@ -119,10 +110,20 @@ pub(super) fn picture(cells: &[Cell]) -> String {
             ]
         })
         .collect();
-    let legend: Vec<(&str, String)> = networks.iter().map(|name| (color(name), name.clone())).collect();
+    let legend: Vec<(&str, String)> = networks.iter().map(|&name| (color(name), name.clone())).collect();
     let subtitle = format!(
         "{}: mean over the seeds, signals never seen in training",
         target.target
     );
     panels::picture(title, &subtitle, &legend, &both)
+}
+
+fn distinct<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
+    let mut found = Vec::new();
+    for name in names {
+        if !found.contains(&name) {
+            found.push(name);
+        }
+    }
+    found
 }
