@@ -85,6 +85,9 @@ pub enum MeshProblem {
     /// A set name that is not defined.
     #[error("set `{0}` is not defined before this line")]
     UndefinedSet(String),
+    /// Sets that hold each other, or the same ranges, too often.
+    #[error("sets have more than {0} members from other sets or ranges")]
+    SetsTooLarge(usize),
     /// A GENERATE line with a bad range.
     #[error("GENERATE range {first}, {last}, {step} is empty or has no step")]
     BadRange {
@@ -271,7 +274,10 @@ impl Reader {
     }
 
     fn keyword(&mut self, keyword: &Keyword<'_>) -> Result<(), MeshProblem> {
-        let owned = |name: &str| keyword.value(name).map(str::to_owned);
+        let owned = |name: &str| {
+            let name = keyword.value(name).filter(|name| !name.is_empty());
+            name.map(str::to_owned)
+        };
         self.section = match keyword.name.as_str() {
             "NODE" => Section::Nodes { set: owned("NSET") },
             "ELEMENT" => {
@@ -316,6 +322,7 @@ impl Reader {
         let (word, parameter) = kind.words();
         let name = keyword
             .value(parameter)
+            .filter(|name| !name.is_empty())
             .ok_or(MeshProblem::MissingParameter {
                 keyword: word,
                 parameter,

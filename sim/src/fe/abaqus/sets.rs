@@ -27,17 +27,34 @@ impl SetKind {
     }
 }
 
+/// Most members that sets of a file take over from other sets: far above every real mesh, and low enough that no
+/// small file becomes a large one by sets that hold each other many times.
+const MOST_TAKEN_OVER: usize = 8_000_000;
+
+/// The same for labels looked at in GENERATE ranges.
+const MOST_LOOKED_AT: usize = 100_000_000;
+
 /// A member: a label with the line that names it (0 for definition lines), or an inclusive range.
 #[derive(Debug, Clone, Copy)]
 enum Member {
-    Label { line: usize, label: u64 },
-    Range { first: u64, last: u64, step: u64 },
+    Label {
+        line: usize,
+        label: u64,
+    },
+    Range {
+        line: usize,
+        first: u64,
+        last: u64,
+        step: u64,
+    },
 }
 
 /// Sets by kind and upper-case name.
 #[derive(Debug, Default)]
 pub(super) struct Sets {
     members: BTreeMap<(SetKind, String), Vec<Member>>,
+    /// Members that came from other sets.
+    taken_over: usize,
 }
 
 type Resolved = BTreeMap<String, Vec<u32>>;
@@ -66,26 +83,32 @@ impl Sets {
         text: &str,
     ) -> Result<(), MeshProblem> {
         let mut added = Vec::new();
+        let name = (kind, name.to_uppercase());
         if generate {
-            added.push(parse_range(text)?);
+            added.push(parse_range(line, text)?);
         } else {
             for entry in entries(text) {
                 if entry.starts_with(|c: char| c.is_ascii_digit()) {
                     let label = parse_label(entry)?;
                     added.push(Member::Label { line, label });
                 } else {
+                    let other_name = (kind, entry.to_uppercase());
                     let other = self
                         .members
-                        .get(&(kind, entry.to_uppercase()))
+                        .get(&other_name)
                         .ok_or_else(|| MeshProblem::UndefinedSet(entry.chars().take(40).collect()))?;
-                    added.extend_from_slice(other);
+                    // A set holds itself already.
+                    if other_name != name {
+                        self.taken_over += other.len();
+                        if self.taken_over > MOST_TAKEN_OVER {
+                            return Err(MeshProblem::SetsTooLarge(MOST_TAKEN_OVER));
+                        }
+                        added.extend_from_slice(other);
+                    }
                 }
             }
         }
-        self.members
-            .entry((kind, name.to_uppercase()))
-            .or_default()
-            .extend(added);
+        self.members.entry(name).or_default().extend(added);
         Ok(())
     }
 
@@ -97,10 +120,17 @@ impl Sets {
         elements: &HashMap<u64, u32>,
     ) -> Result<(Resolved, Resolved), (usize, MeshProblem)> {
         let (mut node_sets, mut element_sets) = (BTreeMap::new(), BTreeMap::new());
+        let sorted = |index: &HashMap<u64, u32>| {
+            let mut labels: Vec<(u64, u32)> = index.iter().map(|(&label, &index)| (label, index)).collect();
+            labels.sort_unstable();
+            labels
+        };
+        let (sorted_nodes, sorted_elements) = (sorted(nodes), sorted(elements));
+        let mut looked_at = 0;
         for ((kind, name), members) in self.members {
-            let (index, sets) = match kind {
-                SetKind::Nodes => (nodes, &mut node_sets),
-                SetKind::Elements => (elements, &mut element_sets),
+            let (index, sorted, sets) = match kind {
+                SetKind::Nodes => (nodes, &sorted_nodes, &mut node_sets),
+                SetKind::Elements => (elements, &sorted_elements, &mut element_sets),
             };
             let mut found = Vec::new();
             for member in members {
@@ -112,15 +142,25 @@ impl Sets {
                         };
                         found.push(*index.get(&label).ok_or((line, undefined))?);
                     }
-                    // a range may be far longer than the mesh: look from the shorter side
-                    Member::Range { first, last, step } => found.extend(
-                        index
-                            .iter()
-                            .filter(|(label, _)| {
-                                (first..=last).contains(label) && (**label - first) % step == 0
-                            })
-                            .map(|(_, index)| *index),
-                    ),
+                    // A range may be far longer than the mesh: only labels that exist are looked at.
+                    Member::Range {
+                        line,
+                        first,
+                        last,
+                        step,
+                    } => {
+                        let from = sorted.partition_point(|(label, _)| *label < first);
+                        let inside = sorted[from..].iter().take_while(|(label, _)| *label <= last);
+                        for (label, index) in inside {
+                            looked_at += 1;
+                            if looked_at > MOST_LOOKED_AT {
+                                return Err((line, MeshProblem::SetsTooLarge(MOST_LOOKED_AT)));
+                            }
+                            if (label - first) % step == 0 {
+                                found.push(*index);
+                            }
+                        }
+                    }
                 }
             }
             found.sort_unstable();
@@ -131,7 +171,7 @@ impl Sets {
     }
 }
 
-fn parse_range(text: &str) -> Result<Member, MeshProblem> {
+fn parse_range(line: usize, text: &str) -> Result<Member, MeshProblem> {
     let numbers = entries(text).map(parse_label).collect::<Result<Vec<_>, _>>()?;
     let (first, last, step) = match numbers[..] {
         [first, last] => (first, last, 1),
@@ -146,5 +186,10 @@ fn parse_range(text: &str) -> Result<Member, MeshProblem> {
     if last < first {
         return Err(MeshProblem::BadRange { first, last, step });
     }
-    Ok(Member::Range { first, last, step })
+    Ok(Member::Range {
+        line,
+        first,
+        last,
+        step,
+    })
 }

@@ -56,6 +56,10 @@ fn refusals_name_the_line_and_the_reason() {
         edit("20, 30\nodd", "20, 30\neven"),
         "line 22: set `even` is not defined before this line"
     );
+    assert_eq!(
+        edit("*Elset, elset=E", "*Elset, elset="),
+        "line 23: *ELSET needs ELSET=…"
+    );
     assert_eq!(edit("20, 30\nodd", "20, 31"), "line 21: node 31 is not defined");
     assert_eq!(
         edit("part=A\n", "part=A\n0., 0., 1.\n"),
@@ -109,4 +113,27 @@ proptest! {
         let end = (at + cut).min(UNIT.len());
         let _ = read_abaqus(&format!("{}{replacement}{}", &UNIT[..at], &UNIT[end..]));
     }
+}
+
+/// Found by a fuzzer: a set that holds itself doubled with every line.
+#[test]
+fn sets_that_hold_each_other_many_times_cost_no_memory() {
+    let itself = UNIT.replace("20, 30\nodd", &format!("20, 30\n{}", "Some\n".repeat(60)));
+    let mesh = read_abaqus(&itself).unwrap();
+    assert_eq!(mesh.node_set("some"), Some(&[1, 2][..]));
+    // Each set holds the one before twice: 2^60 members.
+    let mut chain = String::from("20, 30\n");
+    for set in 0..60 {
+        let before = if set == 0 {
+            "Some".to_owned()
+        } else {
+            format!("s{}", set - 1)
+        };
+        writeln!(chain, "*Nset, nset=s{set}\n{before}, {before}").unwrap();
+    }
+    let error = refusal(&UNIT.replace("20, 30\nodd\n", &chain));
+    assert!(
+        error.ends_with("sets have more than 8000000 members from other sets or ranges"),
+        "{error}"
+    );
 }

@@ -1,0 +1,7 @@
+//! Open Inference Protocol, JSON.
+
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| {
+    hydroflex_fuzz::service::post("infer", "application/json", data);
+});

@@ -1,0 +1,9 @@
+//! Machine files.
+
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| {
+    if let Ok(text) = std::str::from_utf8(data) {
+        let _ = hydroflex_sim::machine::Machine::parse_file(text);
+    }
+});

@@ -1,0 +1,7 @@
+//! Columns as JSON.
+
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| {
+    hydroflex_fuzz::service::post("predict", "application/json", data);
+});

@@ -1,0 +1,7 @@
+//! Columns as Parquet.
+
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| {
+    hydroflex_fuzz::service::post("predict", "application/vnd.apache.parquet", data);
+});
