@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 const LEFT: f64 = 84.0;
 const GAP: f64 = 84.0;
 const RIGHT: f64 = 24.0;
-const TOP: f64 = 104.0;
+const TOP: f64 = 112.0;
 const PANEL: f64 = 190.0;
 const ROW_GAP: f64 = 92.0;
 
