@@ -205,6 +205,11 @@ async fn lost_late_and_repeated_samples_are_handled_and_told() {
     assert_eq!(nothing.status, SampleStatus::Filling);
     let begun = client.sample(&opened, 1001, 1, &[]).await;
     assert_eq!((begun.status, begun.filled), (SampleStatus::Filling, 0));
+    // As far apart as steps can be.
+    let last = client.sample(&opened, u64::MAX, 2, &[]).await;
+    assert_eq!(last.status, SampleStatus::Filling);
+    let first = client.sample(&opened, 0, 3, &[]).await;
+    assert_eq!(first.status, SampleStatus::TooLate);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -264,7 +264,7 @@ impl Session {
     fn take_late(&mut self, step: u64, age: u64, is_whole: bool) -> Taken {
         let place = usize::try_from(age)
             .ok()
-            .and_then(|age| self.is_filled.len().checked_sub(1 + age));
+            .and_then(|age| self.is_filled.len().checked_sub(age)?.checked_sub(1));
         let status = match place {
             Some(place) if is_whole && self.is_filled[place] => {
                 let age = self.is_filled.len() - 1 - place;
