@@ -400,8 +400,8 @@ def over_http(bench, ours, rounds, seconds):
             server.close()
 
 
-def medians(runs):
-    found = {key: statistics.median(run[key] for run in runs) for key in ("p50_us", "p99_us")}
+def medians(runs, keys=("p50_us", "p99_us")):
+    found = {key: statistics.median(run[key] for run in runs) for key in keys}
     return found | {"best_p99_us": min(run["p99_us"] for run in runs)}
 
 
@@ -410,21 +410,25 @@ def start_echo(bench, request):
     return Server("echo", process, json.loads(process.stdout.readline())["address"], "echo")
 
 
-def latency(bench, ours, rounds, seconds):
+def latency(bench, rounds, seconds):
     """p50 and p99 at half of the saturating load, one window as JSON and as bytes, beside a server that answers at once."""
     found = {}
     for name, binary in (("JSON", False), ("bytes", True)):
-        one = request_file(bench, ours, 1, binary)
-        echo = start_echo(bench, one)
-        try:
-            most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
-            runs = {server.name: [] for server in (ours, echo)}
-            for _ in range(rounds):
-                for server in (ours, echo):
-                    runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
-        finally:
-            echo.close()
-        found[name] = {"rate": most / 2} | {server: medians(of) for server, of in runs.items()}
+        with apart() as client:
+            ours = start_ours(bench)
+            one = request_file(bench, ours, 1, binary)
+            echo = start_echo(bench, one)
+            client()
+            try:
+                most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
+                runs = {server.name: [] for server in (ours, echo)}
+                for _ in range(rounds):
+                    for server in (ours, echo):
+                        runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
+            finally:
+                ours.close()
+                echo.close()
+        found[name] = {"rate": most / 2} | {server: medians(of, ("p50_us", "p99_us", "late_p99_us")) for server, of in runs.items()}
         print(name, found[name], flush=True)
     return found
 
@@ -654,10 +658,14 @@ def report(results, arguments):
                          f"{reference['cpu_us'] / median['cpu_us']:.1f} | {us(median['p50_us'])} | {us(median['p99_us'])} |")
     if half := results.get("latency"):
         lines += ["", "## At half of the saturating load (`--only latency`)", "",
-                  "16 connections on a schedule, a sleeping thread each, on the same cores as the service; a latency counts from when its "
-                  "request was due. *Echo* reads as many bytes, looks at nothing and answers at once, in turn with the service: what the machine takes by itself.", "",
-                  "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | echo: p50 µs | p99 µs | best round's p99 µs |", "|---|---|---|---|---|---|---|---|"]
-        lines += [f"| {name} | {f['rate']:.0f} | " + " | ".join(us(f[server][key]) for server in ("hydroflex", "echo") for key in ("p50_us", "p99_us", "best_p99_us")) + " |"
+                  "The service on one half of the cores; on the other one client thread that never sleeps, with 16 connections. A latency counts from when its "
+                  "request was due. *Client late*: how long the client itself let a request wait that was due on a free connection, because other programs had its "
+                  "core; it is in the latencies. *Echo* reads as many bytes, looks at nothing and answers at once, in turn with the service: what the machine takes by "
+                  "itself.", "",
+                  "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | client late: p99 µs | echo: p50 µs | p99 µs | best round's p99 µs | client late: p99 µs |",
+                  "|---|---|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {name} | {f['rate']:.0f} | " + " | ".join(us(f[server][key]) for server in ("hydroflex", "echo")
+                                                               for key in ("p50_us", "p99_us", "best_p99_us", "late_p99_us")) + " |"
                   for name, f in half.items()]
     if over := results.get("overload"):
         lines += ["", "## Overload (`--only overload`)", "",
@@ -739,7 +747,7 @@ def main():
         measures = {
             "kernel": lambda: in_process(bench, arguments.rounds),
             "http": lambda: with_ours(over_http, min(arguments.rounds, 3), arguments.seconds),
-            "latency": lambda: with_ours(latency, arguments.rounds, arguments.seconds),
+            "latency": lambda: latency(bench, arguments.rounds, arguments.seconds),
             "overload": lambda: with_ours(overload, arguments.seconds),
             "streams": lambda: streams(bench, arguments.rounds, arguments.seconds),
             "memory": lambda: with_ours(memory, arguments.requests),
