@@ -50,8 +50,9 @@ class Bench:
         self.kernel_process.wait()
 
 
-def plain_onnx(folder):
-    """The network alone, f32 in and out, as an exporter would write it: onnxruntime's best case."""
+def plain_onnx(folder, bounded=False):
+    """The network alone, f32 in and out, as an exporter would write it: onnxruntime's best case. `bounded`: and what our
+    kernel does besides, the estimate held near the guide and in its range."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -83,6 +84,24 @@ def plain_onnx(folder):
         gemm("skip", "x", "linear")
         nodes.append(helper.make_node("Add", [x, "linear"], ["sum"]))
         x = "sum"
+    if bounded:
+        guard, targets = config["guard"], config["targets"]
+
+        def constant(name, values):
+            constants.append(numpy_helper.from_array(numpy.array(values, numpy.float32), name))
+            return name
+
+        def scaled(ends):
+            return [(end - target["offset"]) / target["scale"] for end, target in zip(ends, targets)]
+
+        gemm("guard", "x", "guide")
+        constant("slack", [slack / target["scale"] for slack, target in zip(guard["slack"], targets)])
+        for place, (operator, inputs) in enumerate([
+            ("Sub", ["guide", "slack"]), ("Add", ["guide", "slack"]), ("Max", [x, "bound0"]), ("Min", ["bound2", "bound1"]),
+            ("Max", ["bound3", constant("lowest", scaled(guard["min"]))]), ("Min", ["bound4", constant("highest", scaled(guard["max"]))]),
+        ]):
+            nodes.append(helper.make_node(operator, inputs, [f"bound{place}"]))
+        x = "bound5"
     values = config["window_steps"] * len(config["inputs"])
     graph = helper.make_graph(
         nodes, "plain",
@@ -107,7 +126,8 @@ def safetensors(path):
 
 
 def in_process(bench, rounds):
-    """µs of CPU per call: our network, onnxruntime's, our whole prediction, model.onnx with its scales."""
+    """µs of CPU per call: our network, onnxruntime's, our whole prediction, model.onnx with its scales, onnxruntime's
+    network with our bounds, torch's."""
     import onnxruntime
 
     torch = import_torch()
@@ -119,6 +139,7 @@ def in_process(bench, rounds):
     for structure in STRUCTURES:
         folder = bench.folder / structure
         plain = onnxruntime.InferenceSession(plain_onnx(folder), options, providers=["CPUExecutionProvider"])
+        bounded = onnxruntime.InferenceSession(plain_onnx(folder, bounded=True), options, providers=["CPUExecutionProvider"])
         whole = onnxruntime.InferenceSession((folder / "model.onnx").read_bytes(), options, providers=["CPUExecutionProvider"])
         compiled = torch and torch_network(torch, folder)
         for batch in BATCHES:
@@ -136,7 +157,8 @@ def in_process(bench, rounds):
             samples = []
             for round_ in range(rounds + 1):
                 network, prediction = bench.kernel(structure, batch, calls)
-                found = [network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window})]
+                found = [network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window}),
+                         time_of(bounded, {"x": x})]
                 if torch:
                     tensor = torch.from_numpy(x)
                     begun = time.thread_time()
@@ -631,19 +653,23 @@ def report(results, arguments):
         "at the end of each part): compare ratios.",
     ]
     if kernel := results.get("kernel"):
-        torch = any(len(row) > 6 for row in kernel)
+        torch = any(len(row) > 7 for row in kernel)
         lines += [
             "", "## In process, one thread, µs of CPU per call (`--only kernel`)", "",
-            "*Network*: f32 in, f32 out, onnxruntime with a plain graph. *Prediction*: samples in engineering units in, estimates out, "
+            "*Network*: f32 in, f32 out. Ours holds every estimate near its guide and in its range (`ml/src/predict/guard.rs`), a second linear map of the window; "
+            "onnxruntime runs the plain graph, as anybody would export it, and then one that has these bounds too, which compares like with like. "
+            "*Prediction*: samples in engineering units in, estimates out, "
             "onnxruntime with our `model.onnx`, which holds the scales. `best` has a skip connection with constant coefficients here; coefficients that "
             "follow the pose are not measured."
             + ("" if torch else " torch is not installed here, so there is no column for it; the script fills one where it is."), "",
-            "| structure | batch | network: ours | onnxruntime | ratio | prediction: ours | onnxruntime | ratio |" + (" torch | ratio |" if torch else ""),
-            "|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
+            "| structure | batch | network: ours | onnxruntime, plain | ratio | with our bounds | ratio |" + (" torch, plain | ratio |" if torch else "")
+            + " prediction: ours | onnxruntime | ratio |",
+            "|---|---|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
         ]
-        for s, b, a, o, p, w, *t in kernel:
-            line = f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(p)} | {us(w)} | {w / p:.2f} |"
-            lines.append(line + "".join(f" {us(v)} | {v / a:.2f} |" for v in t))
+        for s, b, a, o, p, w, g, *t in kernel:
+            line = f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(g)} | {g / a:.2f} |"
+            line += "".join(f" {us(v)} | {v / a:.2f} |" for v in t)
+            lines.append(line + f" {us(p)} | {us(w)} | {w / p:.2f} |")
     if http_table := results.get("http"):
         lines += [
             "", "## Over HTTP, Open Inference Protocol, RLR (`--only http`)", "",
