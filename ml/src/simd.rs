@@ -12,6 +12,8 @@
     reason = "instructions beyond the baseline are unsafe to name, and have to be inlined to be one instruction each"
 )]
 
+use std::sync::OnceLock;
+
 /// Instruction sets with a kernel of their own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Level {
@@ -25,7 +27,14 @@ pub enum Level {
 
 /// The kernel that this process uses.
 #[must_use]
+#[inline]
 pub fn level() -> Level {
+    // Asked for each layer of each window, where the answers of several feature tests would be felt.
+    static LEVEL: OnceLock<Level> = OnceLock::new();
+    *LEVEL.get_or_init(detect)
+}
+
+fn detect() -> Level {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::is_x86_feature_detected as has;
@@ -95,10 +104,18 @@ pub(crate) trait Simd: Copy {
     const OUTPUTS: usize;
     /// The same for f64.
     const OUTPUTS_F64: usize;
+    /// Rows whose sums, [`Self::VECTORS`] vectors each, fit into the registers.
+    const ROWS: usize;
+    /// Vectors of such a row.
+    const VECTORS: usize;
 
     unsafe fn splat(value: f32) -> Self::F;
     unsafe fn load(from: *const f32) -> Self::F;
+    /// The first `count` values of a vector, and zeros; reads no others.
+    unsafe fn load_first(from: *const f32, count: usize) -> Self::F;
     unsafe fn store(to: *mut f32, value: Self::F);
+    /// All values added: the halves of the vector, the halves of what that gives, and so on.
+    unsafe fn sum(value: Self::F) -> f32;
     unsafe fn add(a: Self::F, b: Self::F) -> Self::F;
     unsafe fn mul(a: Self::F, b: Self::F) -> Self::F;
     unsafe fn div(a: Self::F, b: Self::F) -> Self::F;
@@ -115,6 +132,10 @@ pub(crate) trait Simd: Copy {
     unsafe fn load_f64(from: *const f64) -> Self::D;
     /// Loads half a vector of f32 and widens it.
     unsafe fn widen(from: *const f32) -> Self::D;
+    /// The first `count` values of [`Self::widen`], and zeros; reads no others.
+    unsafe fn widen_first(from: *const f32, count: usize) -> Self::D;
+    /// As [`Self::sum`].
+    unsafe fn sum_f64(value: Self::D) -> f64;
     unsafe fn store_f64(to: *mut f64, value: Self::D);
     unsafe fn add_f64(a: Self::D, b: Self::D) -> Self::D;
     unsafe fn fma_f64(a: Self::D, b: Self::D, c: Self::D) -> Self::D;
@@ -139,6 +160,8 @@ impl Simd for Portable {
     const LANES: usize = 4;
     const OUTPUTS: usize = 4;
     const OUTPUTS_F64: usize = 4;
+    const ROWS: usize = 4;
+    const VECTORS: usize = 2;
 
     #[inline(always)]
     unsafe fn splat(value: f32) -> Self::F {
@@ -149,8 +172,20 @@ impl Simd for Portable {
         from.cast::<[f32; 4]>().read_unaligned()
     }
     #[inline(always)]
+    unsafe fn load_first(from: *const f32, count: usize) -> Self::F {
+        let mut values = [0.0; 4];
+        for lane in 0..count.min(4) {
+            values[lane] = from.add(lane).read();
+        }
+        values
+    }
+    #[inline(always)]
     unsafe fn store(to: *mut f32, value: Self::F) {
         to.cast::<[f32; 4]>().write_unaligned(value);
+    }
+    #[inline(always)]
+    unsafe fn sum([a, b, c, d]: Self::F) -> f32 {
+        (a + c) + (b + d)
     }
     #[inline(always)]
     unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
@@ -196,6 +231,18 @@ impl Simd for Portable {
         [f64::from(a), f64::from(b)]
     }
     #[inline(always)]
+    unsafe fn widen_first(from: *const f32, count: usize) -> Self::D {
+        let mut values = [0.0; 2];
+        for lane in 0..count.min(2) {
+            values[lane] = f64::from(from.add(lane).read());
+        }
+        values
+    }
+    #[inline(always)]
+    unsafe fn sum_f64([a, b]: Self::D) -> f64 {
+        a + b
+    }
+    #[inline(always)]
     unsafe fn store_f64(to: *mut f64, value: Self::D) {
         to.cast::<[f64; 2]>().write_unaligned(value);
     }
@@ -232,6 +279,8 @@ mod x86 {
         const LANES: usize = 8;
         const OUTPUTS: usize = 6;
         const OUTPUTS_F64: usize = 6;
+        const ROWS: usize = 6;
+        const VECTORS: usize = 2;
 
         #[inline(always)]
         unsafe fn splat(value: f32) -> Self::F {
@@ -242,8 +291,25 @@ mod x86 {
             _mm256_loadu_ps(from)
         }
         #[inline(always)]
+        unsafe fn load_first(from: *const f32, count: usize) -> Self::F {
+            let lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+            #[allow(
+                clippy::cast_possible_truncation,
+                clippy::cast_possible_wrap,
+                reason = "at most as many as there are lanes"
+            )]
+            let count = _mm256_set1_epi32(count as i32);
+            _mm256_maskload_ps(from, _mm256_cmpgt_epi32(count, lanes))
+        }
+        #[inline(always)]
         unsafe fn store(to: *mut f32, value: Self::F) {
             _mm256_storeu_ps(to, value);
+        }
+        #[inline(always)]
+        unsafe fn sum(value: Self::F) -> f32 {
+            let four = _mm_add_ps(_mm256_castps256_ps128(value), _mm256_extractf128_ps::<1>(value));
+            let two = _mm_add_ps(four, _mm_movehl_ps(four, four));
+            _mm_cvtss_f32(_mm_add_ss(two, _mm_movehdup_ps(two)))
         }
         #[inline(always)]
         unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
@@ -290,6 +356,22 @@ mod x86 {
             _mm256_cvtps_pd(_mm_loadu_ps(from))
         }
         #[inline(always)]
+        unsafe fn widen_first(from: *const f32, count: usize) -> Self::D {
+            #[allow(
+                clippy::cast_possible_truncation,
+                clippy::cast_possible_wrap,
+                reason = "at most as many as there are lanes"
+            )]
+            let count = _mm_set1_epi32(count as i32);
+            let mask = _mm_cmpgt_epi32(count, _mm_setr_epi32(0, 1, 2, 3));
+            _mm256_cvtps_pd(_mm_maskload_ps(from, mask))
+        }
+        #[inline(always)]
+        unsafe fn sum_f64(value: Self::D) -> f64 {
+            let two = _mm_add_pd(_mm256_castpd256_pd128(value), _mm256_extractf128_pd::<1>(value));
+            _mm_cvtsd_f64(_mm_add_sd(two, _mm_unpackhi_pd(two, two)))
+        }
+        #[inline(always)]
         unsafe fn store_f64(to: *mut f64, value: Self::D) {
             _mm256_storeu_pd(to, value);
         }
@@ -309,6 +391,8 @@ mod x86 {
         const LANES: usize = 16;
         const OUTPUTS: usize = 12;
         const OUTPUTS_F64: usize = 12;
+        const ROWS: usize = 6;
+        const VECTORS: usize = 4;
 
         #[inline(always)]
         unsafe fn splat(value: f32) -> Self::F {
@@ -319,8 +403,19 @@ mod x86 {
             _mm512_loadu_ps(from)
         }
         #[inline(always)]
+        unsafe fn load_first(from: *const f32, count: usize) -> Self::F {
+            #[allow(clippy::cast_possible_truncation, reason = "a bit for each lane")]
+            let mask = ((1_u32 << count) - 1) as __mmask16;
+            _mm512_maskz_loadu_ps(mask, from)
+        }
+        #[inline(always)]
         unsafe fn store(to: *mut f32, value: Self::F) {
             _mm512_storeu_ps(to, value);
+        }
+        #[inline(always)]
+        unsafe fn sum(value: Self::F) -> f32 {
+            let upper = _mm256_castpd_ps(_mm512_extractf64x4_pd::<1>(_mm512_castps_pd(value)));
+            Avx2::sum(_mm256_add_ps(_mm512_castps512_ps256(value), upper))
         }
         #[inline(always)]
         unsafe fn add(a: Self::F, b: Self::F) -> Self::F {
@@ -365,6 +460,17 @@ mod x86 {
         #[inline(always)]
         unsafe fn widen(from: *const f32) -> Self::D {
             _mm512_cvtps_pd(_mm256_loadu_ps(from))
+        }
+        #[inline(always)]
+        unsafe fn widen_first(from: *const f32, count: usize) -> Self::D {
+            #[allow(clippy::cast_possible_truncation, reason = "a bit for each lane")]
+            let mask = ((1_u32 << count) - 1) as __mmask8;
+            _mm512_cvtps_pd(_mm256_maskz_loadu_ps(mask, from))
+        }
+        #[inline(always)]
+        unsafe fn sum_f64(value: Self::D) -> f64 {
+            let upper = _mm512_extractf64x4_pd::<1>(value);
+            Avx2::sum_f64(_mm256_add_pd(_mm512_castpd512_pd256(value), upper))
         }
         #[inline(always)]
         unsafe fn store_f64(to: *mut f64, value: Self::D) {

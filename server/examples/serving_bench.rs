@@ -374,59 +374,86 @@ fn whole_answer(buffer: &[u8]) -> anyhow::Result<Option<u16>> {
     Ok((buffer.len() >= head + 4 + length).then_some(status))
 }
 
-/// Requests on a schedule (`rate` per second of all connections), a thread for each connection that sleeps
-/// until the next is due; latencies count from when a request was due.
+/// A connection of an open loop.
+struct Turn {
+    socket: std::net::TcpStream,
+    due: Instant,
+    /// When it was both due and free, once the answer before it had come.
+    ready: Instant,
+    /// When its open request was due.
+    open: Option<Instant>,
+    buffer: Vec<u8>,
+}
+
+/// Requests on a schedule (`rate` per second of all connections, evenly spread), from one thread that never sleeps:
+/// a timer would be late by more than the service takes. Latencies count from when a request was due, so a connection
+/// that still waits for an answer makes its next one wait too; how late this program itself was is counted apart.
 fn open_loop(address: &str, connections: u32, seconds: f64, rate: f64, request: &[u8]) -> anyhow::Result<()> {
     let period = Duration::from_secs_f64(f64::from(connections) / rate);
     let begun = Instant::now() + Duration::from_millis(20);
     let end = begun + Duration::from_secs_f64(seconds);
-    let all = std::thread::scope(|scope| {
-        let connections: Vec<_> = (0..connections)
-            .map(|number| {
-                let first = begun + period.mul_f64(f64::from(number) / f64::from(connections));
-                scope.spawn(move || one_of_open_loop(address, request, first, period, end))
-            })
-            .collect();
-        let mut all = Seen::default();
-        for connection in connections {
-            all.add(connection.join().expect("a connection's thread")?);
+    let mut turns = Vec::new();
+    for number in 0..connections {
+        let socket = std::net::TcpStream::connect(address)?;
+        socket.set_nodelay(true)?;
+        socket.set_nonblocking(true)?;
+        let due = begun + period.mul_f64(f64::from(number) / f64::from(connections));
+        turns.push(Turn {
+            socket,
+            due,
+            ready: due,
+            open: None,
+            buffer: Vec::new(),
+        });
+    }
+    let mut seen = Seen::default();
+    let mut piece = [0; 1 << 14];
+    loop {
+        let mut is_open = false;
+        for turn in &mut turns {
+            if let Some(due) = turn.open {
+                is_open = true;
+                let count = match turn.socket.read(&mut piece) {
+                    Ok(0) => bail!("the server closed the connection"),
+                    Ok(count) => count,
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
+                    Err(error) => return Err(error.into()),
+                };
+                turn.buffer.extend_from_slice(&piece[..count]);
+                if let Some(status) = whole_answer(&turn.buffer)? {
+                    seen.note(status, due);
+                    turn.open = None;
+                    turn.ready = turn.due.max(Instant::now());
+                }
+            } else if turn.due < end {
+                is_open = true;
+                let now = Instant::now();
+                if now >= turn.due {
+                    seen.late_us.push((now - turn.ready).as_secs_f32() * 1e6);
+                    turn.open = Some(turn.due);
+                    turn.due += period;
+                    turn.buffer.clear();
+                    write_whole(&mut turn.socket, request)?;
+                }
+            }
         }
-        anyhow::Ok(all)
-    })?;
-    println!("{}", report(all, seconds));
-    Ok(())
+        if !is_open {
+            println!("{}", report(seen, seconds));
+            return Ok(());
+        }
+    }
 }
 
-fn one_of_open_loop(
-    address: &str,
-    request: &[u8],
-    mut due: Instant,
-    period: Duration,
-    end: Instant,
-) -> anyhow::Result<Seen> {
-    // The kernel may put off a wake-up by 50 µs, to save power, unless it is told not to.
-    nix::sys::prctl::set_timerslack(1)?;
-    let mut socket = std::net::TcpStream::connect(address)?;
-    socket.set_nodelay(true)?;
-    let (mut seen, mut buffer) = (Seen::default(), Vec::new());
-    while due < end {
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        seen.late_us.push(due.elapsed().as_secs_f32() * 1e6);
-        socket.write_all(request)?;
-        buffer.clear();
-        let status = loop {
-            let mut piece = [0; 4096];
-            let count = socket.read(&mut piece)?;
-            ensure!(count > 0, "the server closed the connection");
-            buffer.extend_from_slice(&piece[..count]);
-            if let Some(status) = whole_answer(&buffer)? {
-                break status;
-            }
-        };
-        seen.note(status, due);
-        due += period;
+/// Writes to a socket that does not block.
+fn write_whole(socket: &mut std::net::TcpStream, mut rest: &[u8]) -> anyhow::Result<()> {
+    while !rest.is_empty() {
+        match socket.write(rest) {
+            Ok(count) => rest = &rest[count..],
+            Err(error) if error.kind() == ErrorKind::WouldBlock => std::hint::spin_loop(),
+            Err(error) => return Err(error.into()),
+        }
     }
-    Ok(seen)
+    Ok(())
 }
 
 struct Live<'s> {

@@ -1,5 +1,6 @@
-//! Memory of every program that links this crate: mimalloc, which spends a third of what the C library's allocator spends on a
-//! request (docs/benchmark-serving.md), set up so that a limit on the memory of a process means what it says.
+//! Memory of every program that links this crate: mimalloc, set up so that a limit on the memory of a process means what it says.
+//! A request costs the service 9 % less processor time than with the C library's allocator where it is one window or 64 as JSON,
+//! 31 % less where it is 64 windows as bytes.
 
 #![allow(unsafe_code, reason = "an option of a C library")]
 

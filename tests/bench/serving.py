@@ -50,8 +50,9 @@ class Bench:
         self.kernel_process.wait()
 
 
-def plain_onnx(folder):
-    """The network alone, f32 in and out, as an exporter would write it: onnxruntime's best case."""
+def plain_onnx(folder, bounded=False):
+    """The network alone, f32 in and out, as an exporter would write it: onnxruntime's best case. `bounded`: and what our
+    kernel does besides, the estimate held near the guide and in its range."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -83,6 +84,24 @@ def plain_onnx(folder):
         gemm("skip", "x", "linear")
         nodes.append(helper.make_node("Add", [x, "linear"], ["sum"]))
         x = "sum"
+    if bounded:
+        guard, targets = config["guard"], config["targets"]
+
+        def constant(name, values):
+            constants.append(numpy_helper.from_array(numpy.array(values, numpy.float32), name))
+            return name
+
+        def scaled(ends):
+            return [(end - target["offset"]) / target["scale"] for end, target in zip(ends, targets)]
+
+        gemm("guard", "x", "guide")
+        constant("slack", [slack / target["scale"] for slack, target in zip(guard["slack"], targets)])
+        for place, (operator, inputs) in enumerate([
+            ("Sub", ["guide", "slack"]), ("Add", ["guide", "slack"]), ("Max", [x, "bound0"]), ("Min", ["bound2", "bound1"]),
+            ("Max", ["bound3", constant("lowest", scaled(guard["min"]))]), ("Min", ["bound4", constant("highest", scaled(guard["max"]))]),
+        ]):
+            nodes.append(helper.make_node(operator, inputs, [f"bound{place}"]))
+        x = "bound5"
     values = config["window_steps"] * len(config["inputs"])
     graph = helper.make_graph(
         nodes, "plain",
@@ -107,7 +126,8 @@ def safetensors(path):
 
 
 def in_process(bench, rounds):
-    """µs of CPU per call: our network, onnxruntime's, our whole prediction, model.onnx with its scales."""
+    """µs of CPU per call: our network, onnxruntime's, our whole prediction, model.onnx with its scales, onnxruntime's
+    network with our bounds, torch's."""
     import onnxruntime
 
     torch = import_torch()
@@ -119,6 +139,7 @@ def in_process(bench, rounds):
     for structure in STRUCTURES:
         folder = bench.folder / structure
         plain = onnxruntime.InferenceSession(plain_onnx(folder), options, providers=["CPUExecutionProvider"])
+        bounded = onnxruntime.InferenceSession(plain_onnx(folder, bounded=True), options, providers=["CPUExecutionProvider"])
         whole = onnxruntime.InferenceSession((folder / "model.onnx").read_bytes(), options, providers=["CPUExecutionProvider"])
         compiled = torch and torch_network(torch, folder)
         for batch in BATCHES:
@@ -136,7 +157,8 @@ def in_process(bench, rounds):
             samples = []
             for round_ in range(rounds + 1):
                 network, prediction = bench.kernel(structure, batch, calls)
-                found = [network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window})]
+                found = [network, time_of(plain, {"x": x}), prediction, time_of(whole, {whole.get_inputs()[0].name: window}),
+                         time_of(bounded, {"x": x})]
                 if torch:
                     tensor = torch.from_numpy(x)
                     begun = time.thread_time()
@@ -400,8 +422,8 @@ def over_http(bench, ours, rounds, seconds):
             server.close()
 
 
-def medians(runs):
-    found = {key: statistics.median(run[key] for run in runs) for key in ("p50_us", "p99_us")}
+def medians(runs, keys=("p50_us", "p99_us")):
+    found = {key: statistics.median(run[key] for run in runs) for key in keys}
     return found | {"best_p99_us": min(run["p99_us"] for run in runs)}
 
 
@@ -410,21 +432,25 @@ def start_echo(bench, request):
     return Server("echo", process, json.loads(process.stdout.readline())["address"], "echo")
 
 
-def latency(bench, ours, rounds, seconds):
+def latency(bench, rounds, seconds):
     """p50 and p99 at half of the saturating load, one window as JSON and as bytes, beside a server that answers at once."""
     found = {}
     for name, binary in (("JSON", False), ("bytes", True)):
-        one = request_file(bench, ours, 1, binary)
-        echo = start_echo(bench, one)
-        try:
-            most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
-            runs = {server.name: [] for server in (ours, echo)}
-            for _ in range(rounds):
-                for server in (ours, echo):
-                    runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
-        finally:
-            echo.close()
-        found[name] = {"rate": most / 2} | {server: medians(of) for server, of in runs.items()}
+        with apart() as client:
+            ours = start_ours(bench)
+            one = request_file(bench, ours, 1, binary)
+            echo = start_echo(bench, one)
+            client()
+            try:
+                most = statistics.median(load(bench, ours, one, 16, seconds)["per_second"] for _ in range(3))
+                runs = {server.name: [] for server in (ours, echo)}
+                for _ in range(rounds):
+                    for server in (ours, echo):
+                        runs[server.name].append(load(bench, server, one, 16, seconds, most / 2))
+            finally:
+                ours.close()
+                echo.close()
+        found[name] = {"rate": most / 2} | {server: medians(of, ("p50_us", "p99_us", "late_p99_us")) for server, of in runs.items()}
         print(name, found[name], flush=True)
     return found
 
@@ -627,19 +653,23 @@ def report(results, arguments):
         "at the end of each part): compare ratios.",
     ]
     if kernel := results.get("kernel"):
-        torch = any(len(row) > 6 for row in kernel)
+        torch = any(len(row) > 7 for row in kernel)
         lines += [
             "", "## In process, one thread, µs of CPU per call (`--only kernel`)", "",
-            "*Network*: f32 in, f32 out, onnxruntime with a plain graph. *Prediction*: samples in engineering units in, estimates out, "
+            "*Network*: f32 in, f32 out. Ours holds every estimate near its guide and in its range (`ml/src/predict/guard.rs`), a second linear map of the window; "
+            "onnxruntime runs the plain graph, as anybody would export it, and then one that has these bounds too, which compares like with like. "
+            "*Prediction*: samples in engineering units in, estimates out, "
             "onnxruntime with our `model.onnx`, which holds the scales. `best` has a skip connection with constant coefficients here; coefficients that "
             "follow the pose are not measured."
             + ("" if torch else " torch is not installed here, so there is no column for it; the script fills one where it is."), "",
-            "| structure | batch | network: ours | onnxruntime | ratio | prediction: ours | onnxruntime | ratio |" + (" torch | ratio |" if torch else ""),
-            "|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
+            "| structure | batch | network: ours | onnxruntime, plain | ratio | with our bounds | ratio |" + (" torch, plain | ratio |" if torch else "")
+            + " prediction: ours | onnxruntime | ratio |",
+            "|---|---|---|---|---|---|---|---|---|---|" + ("---|---|" if torch else ""),
         ]
-        for s, b, a, o, p, w, *t in kernel:
-            line = f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(p)} | {us(w)} | {w / p:.2f} |"
-            lines.append(line + "".join(f" {us(v)} | {v / a:.2f} |" for v in t))
+        for s, b, a, o, p, w, g, *t in kernel:
+            line = f"| {s} | {b} | {us(a)} | {us(o)} | {o / a:.2f} | {us(g)} | {g / a:.2f} |"
+            line += "".join(f" {us(v)} | {v / a:.2f} |" for v in t)
+            lines.append(line + f" {us(p)} | {us(w)} | {w / p:.2f} |")
     if http_table := results.get("http"):
         lines += [
             "", "## Over HTTP, Open Inference Protocol, RLR (`--only http`)", "",
@@ -654,10 +684,14 @@ def report(results, arguments):
                          f"{reference['cpu_us'] / median['cpu_us']:.1f} | {us(median['p50_us'])} | {us(median['p99_us'])} |")
     if half := results.get("latency"):
         lines += ["", "## At half of the saturating load (`--only latency`)", "",
-                  "16 connections on a schedule, a sleeping thread each, on the same cores as the service; a latency counts from when its "
-                  "request was due. *Echo* reads as many bytes, looks at nothing and answers at once, in turn with the service: what the machine takes by itself.", "",
-                  "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | echo: p50 µs | p99 µs | best round's p99 µs |", "|---|---|---|---|---|---|---|---|"]
-        lines += [f"| {name} | {f['rate']:.0f} | " + " | ".join(us(f[server][key]) for server in ("hydroflex", "echo") for key in ("p50_us", "p99_us", "best_p99_us")) + " |"
+                  "The service on one half of the cores; on the other one client thread that never sleeps, with 16 connections. A latency counts from when its "
+                  "request was due. *Client late*: how long the client itself let a request wait that was due on a free connection, because other programs had its "
+                  "core; it is in the latencies. *Echo* reads as many bytes, looks at nothing and answers at once, in turn with the service: what the machine takes by "
+                  "itself.", "",
+                  "| one window as | requests/s | p50 µs | p99 µs | best round's p99 µs | client late: p99 µs | echo: p50 µs | p99 µs | best round's p99 µs | client late: p99 µs |",
+                  "|---|---|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {name} | {f['rate']:.0f} | " + " | ".join(us(f[server][key]) for server in ("hydroflex", "echo")
+                                                               for key in ("p50_us", "p99_us", "best_p99_us", "late_p99_us")) + " |"
                   for name, f in half.items()]
     if over := results.get("overload"):
         lines += ["", "## Overload (`--only overload`)", "",
@@ -739,7 +773,7 @@ def main():
         measures = {
             "kernel": lambda: in_process(bench, arguments.rounds),
             "http": lambda: with_ours(over_http, min(arguments.rounds, 3), arguments.seconds),
-            "latency": lambda: with_ours(latency, arguments.rounds, arguments.seconds),
+            "latency": lambda: latency(bench, arguments.rounds, arguments.seconds),
             "overload": lambda: with_ours(overload, arguments.seconds),
             "streams": lambda: streams(bench, arguments.rounds, arguments.seconds),
             "memory": lambda: with_ours(memory, arguments.requests),

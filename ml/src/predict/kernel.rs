@@ -1,19 +1,23 @@
 //! Dense layers in f32 without a tensor framework: packed weights, register blocks, no allocation.
 //!
-//! A layer is packed twice, because many windows and few windows want opposite things:
+//! A layer is packed twice, because windows come in two forms:
 //!
-//! - **Many**: windows are the lanes. [`PANEL`] windows stand side by side (`panel[value][window]`),
-//!   a block of 12 outputs × 2 vectors of windows is summed in registers, and one weight at a
-//!   time is multiplied with both vectors. The result has the form that the next layer takes, so a
-//!   panel goes through the whole network without leaving the second-level cache. Nothing is
-//!   padded: 60 outputs cost 60.
-//! - **Few**: outputs are the lanes. Weights are packed into groups of 16 outputs
-//!   (`group[input][16]`), so that a vector holds the weights of one input, and every weight is read
-//!   once.
+//! - **Rows**, one window after the other: outputs are the lanes. Weights are packed into groups of 16
+//!   outputs (`group[input][16]`), a block of six rows × four vectors of outputs is summed in registers, and
+//!   one value of each row at a time is multiplied with the weights of its input. Values are read where they
+//!   are; the result has the form that the next layer takes.
+//! - **Side by side**, as the overlapping windows of a recording are (`panel[value][window]`, [`PANEL`] of
+//!   them): windows are the lanes, a block of 12 outputs × 2 vectors of windows is summed in registers, and one
+//!   weight at a time is multiplied with both vectors. Nothing is copied to make a window of a recording, and
+//!   nothing is padded: 60 outputs cost 60.
 //!
 //! Both add the same products in the same order, fused alike: an estimate has the same bits whichever
-//! way it is computed and whatever stands beside it. A layer of few outputs (`NARROW`) has few
-//! sums, each of which would wait for itself; it adds in four parts.
+//! way it is computed and whatever stands beside it. A layer of few outputs (`NARROW`) would fill few
+//! lanes, and each of its sums would wait for itself: it adds in 16 parts, which are the lanes where windows are
+//! rows.
+//!
+//! A group of outputs that is not full costs as much as a full one. What else is a linear map of the same inputs
+//! can stand there, *beside* the layer, see [`PackedLayer::with_beside`].
 
 #![allow(
     unsafe_code,
@@ -38,23 +42,26 @@ const GROUP: usize = 16;
 /// Outputs in a tile: as many as two vectors each leave registers for.
 const TILE: usize = 12;
 /// Outputs up to which sums are made in parts.
-const NARROW: usize = 4;
+const NARROW: usize = 6;
 /// Parts of such a sum.
-const PARTS: usize = 4;
+const PARTS: usize = 16;
 
 /// Sixteen weights on a cache line of their own.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C, align(64))]
 struct Lanes([f32; GROUP]);
 
-/// `f(W x + b)` with packed W.
+/// `f(W x + b)` with packed W, and linear outputs beside it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PackedLayer {
     inputs: usize,
+    /// Those beside too.
     outputs: usize,
-    /// `[group][input][16]`.
+    /// The last ones, which no activation touches.
+    beside: usize,
+    /// `[group][input][16]`; none of a narrow layer.
     groups: Vec<Lanes>,
-    /// `[tile][input][outputs of the tile]`.
+    /// `[tile][input][outputs of the tile]`; of a narrow layer `[output][input]`.
     tiles: Vec<f32>,
     bias: Vec<f32>,
     activations: Vec<Activation>,
@@ -91,21 +98,51 @@ impl PackedLayer {
         let outputs = map.bias.len();
         let inputs = map.weight.len() / outputs.max(1);
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
+        let is_narrow = outputs <= NARROW;
         let group_count = outputs.div_ceil(GROUP);
-        let mut groups = vec![Lanes([0.0; GROUP]); group_count * inputs];
-        let tiles = pack(&map.weight, outputs, TILE, |output, input, weight| {
-            groups[output / GROUP * inputs + input].0[output % GROUP] = weight;
+        let mut groups = vec![Lanes([0.0; GROUP]); if is_narrow { 0 } else { group_count * inputs }];
+        let tile = if is_narrow { 1 } else { TILE };
+        let tiles = pack(&map.weight, outputs, tile, |output, input, weight| {
+            if !is_narrow {
+                groups[output / GROUP * inputs + input].0[output % GROUP] = weight;
+            }
         });
         let mut bias = map.bias.clone();
         bias.resize(group_count * GROUP, 0.0);
         Self {
             inputs,
             outputs,
+            beside: 0,
             groups,
             tiles,
             bias,
             activations: activations.to_vec(),
         }
+    }
+
+    /// Packs `map`, and beside it another map of the same inputs, whose outputs are not activated.
+    ///
+    /// # Panics
+    /// When weights and biases do not fit, or the maps have other inputs.
+    #[must_use]
+    pub fn with_beside(map: &LinearWeights, activations: &[Activation], beside: &LinearWeights) -> Self {
+        let inputs = |map: &LinearWeights| map.weight.len() / map.bias.len().max(1);
+        assert_eq!(inputs(map), inputs(beside), "maps of the same inputs");
+        let both = LinearWeights {
+            weight: [map.weight.as_slice(), &beside.weight].concat(),
+            bias: [map.bias.as_slice(), &beside.bias].concat(),
+        };
+        Self {
+            beside: beside.bias.len(),
+            ..Self::new(&both, activations)
+        }
+    }
+
+    /// Whether so many outputs beside a layer of `outputs` cost next to nothing.
+    #[must_use]
+    pub fn has_room(outputs: usize, beside: usize) -> bool {
+        outputs + beside <= NARROW
+            || (outputs > NARROW && outputs % GROUP + beside <= GROUP && outputs % GROUP > 0)
     }
 
     /// Values in.
@@ -114,10 +151,16 @@ impl PackedLayer {
         self.inputs
     }
 
-    /// Values out, without padding.
+    /// Values out, without padding and without those beside.
     #[must_use]
     pub fn outputs(&self) -> usize {
-        self.outputs
+        self.outputs - self.beside
+    }
+
+    /// Values beside them.
+    #[must_use]
+    pub fn beside(&self) -> usize {
+        self.beside
     }
 
     /// Values out, filled up to whole groups.
@@ -130,16 +173,32 @@ impl PackedLayer {
         self.outputs <= NARROW
     }
 
-    /// Output for few `rows` of inputs that begin `stride` values apart in `x`, written row by row
-    /// with [`Self::padded`] values each.
+    /// Output for `rows` of inputs that begin `stride` values apart in `x`, written row by row with
+    /// [`Self::padded`] values each.
     ///
     /// # Panics
     /// When a slice is too short.
     pub fn forward(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f32]) {
-        self.forward_at(level(), x, stride, rows, out);
+        self.forward_at(level(), x, stride, rows, out, None);
     }
 
-    fn forward_at(&self, level: Level, x: &[f32], stride: usize, rows: usize, out: &mut [f32]) {
+    /// As [`Self::forward`]; the outputs beside come to `beside`, [`Self::beside`] values a row.
+    ///
+    /// # Panics
+    /// When a slice is too short.
+    pub fn forward_with(&self, x: &[f32], stride: usize, rows: usize, out: &mut [f32], beside: &mut [f32]) {
+        self.forward_at(level(), x, stride, rows, out, Some(beside));
+    }
+
+    fn forward_at(
+        &self,
+        level: Level,
+        x: &[f32],
+        stride: usize,
+        rows: usize,
+        out: &mut [f32],
+        beside: Option<&mut [f32]>,
+    ) {
         if rows == 0 {
             return;
         }
@@ -148,12 +207,14 @@ impl PackedLayer {
             "inputs of {rows} rows"
         );
         assert!(out.len() >= rows * self.padded(), "room for {rows} rows");
+        let beside = beside.unwrap_or_default();
         let layer = self;
-        dispatch!(level, PackedLayer::few(layer: &PackedLayer, x: &[f32], stride: usize, rows: usize, out: &mut [f32]));
+        dispatch!(level, PackedLayer::rows(layer: &PackedLayer, x: &[f32], stride: usize, rows: usize, out: &mut [f32], beside: &mut [f32]));
     }
 
     /// Output for a panel: value i of the window in column c is `x[places[i] + c]`, output o comes
-    /// to stand at `out[o · PANEL + c]`. The columns up to the next multiple of 16 are computed too.
+    /// to stand at `out[o · PANEL + c]`, those beside after the others. The columns up to the next multiple of 16
+    /// are computed too.
     ///
     /// # Panics
     /// When a slice is too short or there are more columns than [`PANEL`].
@@ -172,7 +233,7 @@ impl PackedLayer {
         dispatch!(level, PackedLayer::many(layer: &PackedLayer, x: &[f32], places: &[usize], columns: usize, out: &mut [f32]));
     }
 
-    // --- many windows ---
+    // --- side by side ---
 
     /// Lengths were compared by the caller.
     #[inline(always)]
@@ -181,14 +242,11 @@ impl PackedLayer {
         if layer.is_narrow() {
             for column in (0..columns).step_by(S::LANES) {
                 let (x, out) = (x.as_ptr().add(column), out.as_mut_ptr().add(column));
-                match layer.outputs {
-                    1 => layer.narrow_block::<S, 1>(x, places, out),
-                    2 => layer.narrow_block::<S, 2>(x, places, out),
-                    3 => layer.narrow_block::<S, 3>(x, places, out),
-                    _ => layer.narrow_block::<S, 4>(x, places, out),
+                for output in 0..layer.outputs {
+                    layer.narrow_column::<S>(output, x, places, out);
                 }
             }
-            layer.activate_panel::<S>(columns, &mut out[..layer.outputs * PANEL]);
+            layer.activate_panel::<S>(columns, &mut out[..layer.outputs() * PANEL]);
             return;
         }
         for first in (0..layer.outputs).step_by(TILE) {
@@ -215,7 +273,8 @@ impl PackedLayer {
                 column += S::LANES;
             }
             // While its sums are in the first-level cache.
-            layer.activate_panel::<S>(columns, &mut out[first * PANEL..(first + width) * PANEL]);
+            let activated = (first + width).min(layer.outputs()).max(first);
+            layer.activate_panel::<S>(columns, &mut out[first * PANEL..activated * PANEL]);
         }
     }
 
@@ -309,85 +368,141 @@ impl PackedLayer {
         }
     }
 
-    /// All R outputs of a narrow layer for one vector of columns, in four parts.
+    /// One output of a narrow layer for one vector of columns.
     #[inline(always)]
-    unsafe fn narrow_block<S: Simd, const R: usize>(&self, x: *const f32, places: &[usize], out: *mut f32) {
-        let mut sums = [[S::splat(0.0); R]; PARTS];
-        let (fours, rest) = places.as_chunks::<PARTS>();
-        let mut weights = self.tiles.as_ptr();
-        for places in fours {
+    unsafe fn narrow_column<S: Simd>(&self, output: usize, x: *const f32, places: &[usize], out: *mut f32) {
+        let mut sums = [S::splat(0.0); PARTS];
+        let mut weights = self.tiles.as_ptr().add(output * self.inputs);
+        let (whole, rest) = places.as_chunks::<PARTS>();
+        for places in whole {
             for part in 0..PARTS {
                 let value = S::load(x.add(places[part]));
-                for r in 0..R {
-                    sums[part][r] = S::fma(S::splat(*weights.add(r)), value, sums[part][r]);
-                }
-                weights = weights.add(R);
+                sums[part] = S::fma(S::splat(*weights.add(part)), value, sums[part]);
             }
+            weights = weights.add(PARTS);
         }
         for (part, &place) in rest.iter().enumerate() {
             let value = S::load(x.add(place));
-            for r in 0..R {
-                sums[part][r] = S::fma(S::splat(*weights.add(r)), value, sums[part][r]);
+            sums[part] = S::fma(S::splat(*weights.add(part)), value, sums[part]);
+        }
+        // As halves of a vector are added, see `Simd::sum`.
+        for half in [8, 4, 2, 1] {
+            for part in 0..half {
+                sums[part] = S::add(sums[part], sums[part + half]);
             }
-            weights = weights.add(R);
         }
-        for r in 0..R {
-            let sum = S::add(S::add(sums[0][r], sums[1][r]), S::add(sums[2][r], sums[3][r]));
-            S::store(out.add(r * PANEL), S::add(sum, S::splat(self.bias[r])));
-        }
+        S::store(
+            out.add(output * PANEL),
+            S::add(sums[0], S::splat(self.bias[output])),
+        );
     }
 
-    // --- few windows ---
+    // --- rows ---
 
-    /// Lengths were compared by the caller.
+    /// Lengths were compared by the caller, except that of `beside`, which may be missing.
     #[inline(always)]
-    unsafe fn few<S: Simd>(layer: &Self, x: &[f32], stride: usize, rows: usize, out: &mut [f32]) {
+    unsafe fn rows<S: Simd>(
+        layer: &Self,
+        x: &[f32],
+        stride: usize,
+        rows: usize,
+        out: &mut [f32],
+        beside: &mut [f32],
+    ) {
+        let (from, to) = (x.as_ptr(), out.as_mut_ptr());
         let mut row = 0;
-        // Two rows share each weight; more would need more registers than AVX2 has.
-        while row + 2 <= rows {
-            layer.rows::<S, 2>(
-                x.as_ptr().add(row * stride),
-                stride,
-                out.as_mut_ptr().add(row * layer.padded()),
-            );
-            row += 2;
+        while row < rows {
+            let rest = rows - row;
+            let (from, to) = (from.add(row * stride), to.add(row * layer.padded()));
+            row += if rest >= S::ROWS {
+                // As many blocks as there are: weights that stay in a cache meanwhile are read once.
+                let blocks = rest / S::ROWS;
+                if S::ROWS == 6 {
+                    layer.strips::<S, 6>(from, stride, blocks, to);
+                } else {
+                    layer.strips::<S, 4>(from, stride, blocks, to);
+                }
+                blocks * S::ROWS
+            } else if rest >= 4 {
+                layer.strips::<S, 4>(from, stride, 1, to);
+                4
+            } else if rest >= 2 {
+                layer.strips::<S, 2>(from, stride, 1, to);
+                2
+            } else {
+                layer.strips::<S, 1>(from, stride, 1, to);
+                1
+            };
         }
-        if row < rows {
-            layer.rows::<S, 1>(
-                x.as_ptr().add(row * stride),
-                stride,
-                out.as_mut_ptr().add(row * layer.padded()),
-            );
+        if layer.beside > 0 {
+            for row in 0..rows.min(beside.len() / layer.beside) {
+                for place in 0..layer.beside {
+                    *beside.as_mut_ptr().add(row * layer.beside + place) =
+                        *to.add(row * layer.padded() + layer.outputs() + place);
+                }
+            }
         }
         for &activation in &layer.activations {
             activate::<S>(activation, &mut out[..rows * layer.padded()]);
         }
     }
 
+    /// All outputs of `blocks` times R rows.
     #[inline(always)]
-    unsafe fn rows<S: Simd, const R: usize>(&self, x: *const f32, stride: usize, out: *mut f32) {
-        let vectors = self.padded() / S::LANES;
-        let mut vector = 0;
+    unsafe fn strips<S: Simd, const R: usize>(
+        &self,
+        x: *const f32,
+        stride: usize,
+        blocks: usize,
+        out: *mut f32,
+    ) {
         if self.is_narrow() {
-            while vector < vectors {
-                self.vectors::<S, R, 1, PARTS>(vector, x, stride, out);
-                vector += 1;
+            for block in 0..blocks {
+                let (x, out) = (x.add(block * R * stride), out.add(block * R * self.padded()));
+                for output in 0..self.outputs {
+                    self.narrow_rows::<S, R>(output, x, stride, out);
+                }
             }
             return;
         }
-        while vector + 4 <= vectors {
-            self.vectors::<S, R, 4, 1>(vector, x, stride, out);
-            vector += 4;
-        }
+        let vectors = self.padded() / S::LANES;
+        let mut vector = 0;
         while vector < vectors {
-            self.vectors::<S, R, 1, 1>(vector, x, stride, out);
-            vector += 1;
+            // Few rows leave registers for more outputs.
+            let most = if R <= 2 { 4 } else { S::VECTORS };
+            vector += match (vectors - vector).min(most) {
+                4.. => self.strip::<S, R, 4>(vector, x, stride, blocks, out),
+                3 => self.strip::<S, R, 3>(vector, x, stride, blocks, out),
+                2 => self.strip::<S, R, 2>(vector, x, stride, blocks, out),
+                _ => self.strip::<S, R, 1>(vector, x, stride, blocks, out),
+            };
         }
     }
 
-    /// R rows × V vectors of outputs, summed in N parts in registers over all inputs.
+    /// V vectors of outputs of `blocks` times R rows; returns V.
     #[inline(always)]
-    unsafe fn vectors<S: Simd, const R: usize, const V: usize, const N: usize>(
+    unsafe fn strip<S: Simd, const R: usize, const V: usize>(
+        &self,
+        first: usize,
+        x: *const f32,
+        stride: usize,
+        blocks: usize,
+        out: *mut f32,
+    ) -> usize {
+        for block in 0..blocks {
+            self.block_of_rows::<S, R, V>(
+                first,
+                x.add(block * R * stride),
+                stride,
+                out.add(block * R * self.padded()),
+            );
+        }
+        V
+    }
+
+    /// R rows × V vectors of outputs, summed in registers over all inputs.
+    #[inline(always)]
+    unsafe fn block_of_rows<S: Simd, const R: usize, const V: usize>(
         &self,
         first: usize,
         x: *const f32,
@@ -400,48 +515,91 @@ impl PackedLayer {
             let lane = (first + v) * S::LANES;
             pointers[v] = weights.add(lane / GROUP * self.inputs * GROUP + lane % GROUP);
         }
-        let mut sums = [[[S::splat(0.0); V]; R]; N];
-        let whole = self.inputs - self.inputs % N;
-        for input in (0..whole).step_by(N) {
-            for part in 0..N {
-                Self::products::<S, R, V>(&pointers, input + part, x, stride, &mut sums[part]);
+        let mut sums = [[S::splat(0.0); V]; R];
+        for input in 0..self.inputs {
+            let mut lanes = [S::splat(0.0); V];
+            for v in 0..V {
+                lanes[v] = S::load(pointers[v].add(input * GROUP));
             }
-        }
-        for part in 0..self.inputs - whole {
-            Self::products::<S, R, V>(&pointers, whole + part, x, stride, &mut sums[part]);
+            for r in 0..R {
+                let value = S::splat(*x.add(r * stride + input));
+                for v in 0..V {
+                    sums[r][v] = S::fma(value, lanes[v], sums[r][v]);
+                }
+            }
         }
         for r in 0..R {
             for v in 0..V {
                 let lane = (first + v) * S::LANES;
-                let mut sum = sums[0][r][v];
-                if N == PARTS {
-                    sum = S::add(S::add(sum, sums[1][r][v]), S::add(sums[2][r][v], sums[3][r][v]));
-                }
                 S::store(
                     out.add(r * self.padded() + lane),
-                    S::add(sum, S::load(self.bias.as_ptr().add(lane))),
+                    S::add(sums[r][v], S::load(self.bias.as_ptr().add(lane))),
                 );
             }
         }
     }
 
+    /// One output of a narrow layer for R rows.
     #[inline(always)]
-    unsafe fn products<S: Simd, const R: usize, const V: usize>(
-        pointers: &[*const f32; V],
-        input: usize,
+    unsafe fn narrow_rows<S: Simd, const R: usize>(
+        &self,
+        output: usize,
         x: *const f32,
         stride: usize,
-        sums: &mut [[S::F; V]; R],
+        out: *mut f32,
     ) {
-        let mut lanes = [S::splat(0.0); V];
-        for v in 0..V {
-            lanes[v] = S::load(pointers[v].add(input * GROUP));
+        let weights = self.tiles.as_ptr().add(output * self.inputs);
+        let mut totals = [0.0; R];
+        match S::LANES {
+            16 => self.dots::<S, R, 1>(weights, x, stride, &mut totals),
+            8 => self.dots::<S, R, 2>(weights, x, stride, &mut totals),
+            _ => self.dots::<S, R, 4>(weights, x, stride, &mut totals),
         }
         for r in 0..R {
-            let value = S::splat(*x.add(r * stride + input));
+            *out.add(r * self.padded() + output) = totals[r] + self.bias[output];
+        }
+    }
+
+    /// `weights · row` for R rows, in [`PARTS`] parts, V vectors of them.
+    #[inline(always)]
+    unsafe fn dots<S: Simd, const R: usize, const V: usize>(
+        &self,
+        weights: *const f32,
+        x: *const f32,
+        stride: usize,
+        totals: &mut [f32; R],
+    ) {
+        let mut sums = [[S::splat(0.0); V]; R];
+        let whole = self.inputs - self.inputs % PARTS;
+        for input in (0..whole).step_by(PARTS) {
             for v in 0..V {
-                sums[r][v] = S::fma(value, lanes[v], sums[r][v]);
+                let lanes = S::load(weights.add(input + v * S::LANES));
+                for r in 0..R {
+                    let values = S::load(x.add(r * stride + input + v * S::LANES));
+                    sums[r][v] = S::fma(lanes, values, sums[r][v]);
+                }
             }
+        }
+        for v in 0..V {
+            let input = whole + v * S::LANES;
+            if input < self.inputs {
+                let count = (self.inputs - input).min(S::LANES);
+                let lanes = S::load_first(weights.add(input), count);
+                for r in 0..R {
+                    let values = S::load_first(x.add(r * stride + input), count);
+                    sums[r][v] = S::fma(lanes, values, sums[r][v]);
+                }
+            }
+        }
+        for r in 0..R {
+            let mut half = V / 2;
+            while half > 0 {
+                for v in 0..half {
+                    sums[r][v] = S::add(sums[r][v], sums[r][v + half]);
+                }
+                half /= 2;
+            }
+            totals[r] = S::sum(sums[r][0]);
         }
     }
 }
@@ -475,7 +633,7 @@ mod tests {
     /// Both ways to compute a layer, row by row without padding.
     fn both(layer: &PackedLayer, level: Level, x: &[f32], stride: usize, rows: usize) -> [Vec<f32>; 2] {
         let mut few = vec![f32::NAN; rows * layer.padded()];
-        layer.forward_at(level, x, stride, rows, &mut few);
+        layer.forward_at(level, x, stride, rows, &mut few, None);
         let few = few
             .chunks(layer.padded())
             .flat_map(|row| row[..layer.outputs()].to_vec());
@@ -532,6 +690,52 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_map_beside_a_layer_has_the_same_bits_as_alone_where_sums_are_made_alike_and_stays_linear() {
+        for (outputs, beside, inputs) in [(60, 1, 300), (13, 3, 50), (1, 1, 300), (3, 3, 37), (90, 2, 31)] {
+            assert!(PackedLayer::has_room(outputs, beside));
+            let (main, other) = (map(outputs, inputs, 1), map(beside, inputs, 2));
+            let layer = PackedLayer::with_beside(&main, &[Activation::Relu], &other);
+            let alone = PackedLayer::new(&main, &[Activation::Relu]);
+            assert_eq!((layer.outputs(), layer.beside()), (outputs, beside));
+            for rows in [1, 9, 32] {
+                let x = map(1, rows * inputs, 9).weight;
+                for level in levels() {
+                    let mut found = vec![f32::NAN; rows * layer.padded()];
+                    let mut found_beside = vec![f32::NAN; rows * beside];
+                    layer.forward_at(level, &x, inputs, rows, &mut found, Some(&mut found_beside));
+                    let mut expected = vec![f32::NAN; rows * alone.padded()];
+                    alone.forward_at(level, &x, inputs, rows, &mut expected, None);
+                    let mut panel = vec![f32::NAN; inputs * PANEL];
+                    let mut out = vec![f32::NAN; (outputs + beside) * PANEL];
+                    transpose(&x, inputs, rows, inputs, &mut panel);
+                    let places: Vec<usize> = (0..inputs).map(|i| i * PANEL).collect();
+                    layer.forward_panel_at(level, &panel, &places, rows, &mut out);
+                    for row in 0..rows {
+                        for output in 0..outputs {
+                            let value = found[row * layer.padded() + output];
+                            assert_eq!(value, expected[row * alone.padded() + output], "{level:?}");
+                            assert_eq!(value, out[output * PANEL + row], "{level:?}");
+                        }
+                        for b in 0..beside {
+                            let value = found_beside[row * beside + b];
+                            assert_eq!(value, out[(outputs + b) * PANEL + row], "{level:?}");
+                            let z: f64 = (0..inputs)
+                                .map(|i| {
+                                    f64::from(other.weight[b * inputs + i]) * f64::from(x[row * inputs + i])
+                                })
+                                .sum::<f64>()
+                                + f64::from(other.bias[b]);
+                            // Up to 300 f32 products of size one.
+                            assert!((f64::from(value) - z).abs() < 3e-5, "{level:?}: {value} {z}");
+                        }
+                    }
+                }
+            }
+        }
+        assert!(!PackedLayer::has_room(256, 1) && !PackedLayer::has_room(4, 3));
     }
 
     #[test]

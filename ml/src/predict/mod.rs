@@ -22,8 +22,10 @@ pub use scale::Sample;
 use scale::ScaleMap;
 use skip::SkipKernel;
 
-/// Windows from which on a panel is faster than one window after the other.
+/// Windows from which on those that are rows are turned into a panel where that is faster: for a skip connection.
 const MANY: usize = 8;
+/// Windows that go through the network together: blocks of six where they are rows, whole panels otherwise.
+const ROWS: usize = 48;
 
 /// A model ready to estimate. Shared between threads; each brings its own [`Workspace`].
 #[derive(Debug, Clone, PartialEq)]
@@ -144,11 +146,19 @@ fn last_step(config: &ModelConfig, weights: &Weights) -> Weights {
     own
 }
 
-fn packed(config: &ModelConfig, weights: &Weights) -> Vec<PackedLayer> {
-    fold(config, weights)
+/// The network's layers, with `guide` beside the first one where that has room.
+fn packed(config: &ModelConfig, weights: &Weights, guide: Option<&LinearWeights>) -> Vec<PackedLayer> {
+    let layers = fold(config, weights);
+    let mut packed: Vec<PackedLayer> = layers
         .iter()
         .map(|(activations, map)| PackedLayer::new(map, activations))
-        .collect()
+        .collect();
+    if let (Some(first), Some((activations, map)), Some(guide)) = (packed.first_mut(), layers.first(), guide)
+        && PackedLayer::has_room(map.bias.len(), guide.bias.len())
+    {
+        *first = PackedLayer::with_beside(map, activations, guide);
+    }
+    packed
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
@@ -177,14 +187,15 @@ impl Predictor {
     #[must_use]
     pub fn new(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Self {
         let several = config.output_steps > 1;
+        let guide = config.guard.as_ref().and(weights.guard.as_ref());
         let layers = if several {
-            packed(config, &last_step(config, weights))
+            packed(config, &last_step(config, weights), guide)
         } else {
-            packed(config, weights)
+            packed(config, weights, guide)
         };
         let all_steps = several.then(|| AllSteps {
             steps: config.output_steps,
-            layers: packed(config, weights),
+            layers: packed(config, weights, None),
             limits: config.guard.as_ref().map_or_else(
                 || vec![[f64::NEG_INFINITY, f64::INFINITY]; config.targets.len()],
                 |guard| {
@@ -207,11 +218,11 @@ impl Predictor {
                 config.targets.len(),
             )
         });
-        let guard = config
-            .guard
-            .as_ref()
-            .zip(weights.guard.as_ref())
-            .map(|(guard, guide)| GuardKernel::new(guide, guard, &config.targets));
+        let is_beside = layers.first().is_some_and(|first| first.beside() > 0);
+        let guard =
+            config.guard.as_ref().zip(guide).map(|(guard, guide)| {
+                GuardKernel::new((!is_beside).then_some(guide), guard, &config.targets)
+            });
         let envelope = config
             .envelope
             .as_ref()
@@ -319,17 +330,18 @@ impl Predictor {
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
         let skip = self.skip.as_ref().map_or(0, SkipKernel::padded);
+        let is_turned = self.skip.as_ref().is_some_and(|skip| !skip.is_narrow());
         let projected = self.envelope.as_ref().map_or(0, |e| e.projection.padded());
         Workspace {
-            window: vec![0.0; PANEL * self.window_len()],
-            panel: vec![0.0; PANEL * self.window_len()],
-            scaled: vec![0.0; PANEL * self.targets.len()],
-            ping: vec![0.0; PANEL * widest],
-            pong: vec![0.0; PANEL * widest],
-            skip: vec![0.0; PANEL * skip],
-            guide: vec![0.0; PANEL * self.guard.as_ref().map_or(0, GuardKernel::padded)],
-            limited: vec![false; PANEL],
-            projected: vec![0.0; PANEL * projected],
+            window: vec![0.0; ROWS * self.window_len()],
+            panel: vec![0.0; if is_turned { PANEL * self.window_len() } else { 0 }],
+            scaled: vec![0.0; ROWS * self.targets.len()],
+            ping: vec![0.0; ROWS * widest],
+            pong: vec![0.0; ROWS * widest],
+            skip: vec![0.0; ROWS * skip],
+            guide: vec![0.0; ROWS * self.guard.as_ref().map_or(0, GuardKernel::padded)],
+            limited: vec![false; ROWS],
+            projected: vec![0.0; ROWS * projected],
         }
     }
 
@@ -374,12 +386,14 @@ impl Predictor {
             "one flag per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
-        let mut panel = std::mem::take(&mut workspace.panel);
-        for (block, samples) in windows.chunks(PANEL * size).enumerate() {
+        for (block, samples) in windows.chunks(ROWS * size).enumerate() {
             let rows = samples.len() / size;
-            let first = block * PANEL;
+            let first = block * ROWS;
             self.maps.scale(samples, &mut scaled);
-            let arranged = self.arrange(&scaled, size, rows, &mut panel);
+            let arranged = Windows::Rows {
+                x: &scaled,
+                stride: size,
+            };
             self.block(arranged, rows, workspace);
             self.unscale(
                 rows,
@@ -395,7 +409,6 @@ impl Predictor {
             }
         }
         workspace.window = scaled;
-        workspace.panel = panel;
     }
 
     /// Scaled estimates for windows of scaled values that begin `stride` values apart: the network
@@ -413,15 +426,13 @@ impl Predictor {
     ) {
         let targets = self.targets.len();
         assert_eq!(out.len(), rows * targets, "one row of estimates per window");
-        let mut panel = std::mem::take(&mut workspace.panel);
-        for first in (0..rows).step_by(PANEL) {
-            let block = PANEL.min(rows - first);
-            let arranged = self.arrange(&scaled[first * stride..], stride, block, &mut panel);
-            self.block(arranged, block, workspace);
+        for first in (0..rows).step_by(ROWS) {
+            let block = ROWS.min(rows - first);
+            let x = &scaled[first * stride..];
+            self.block(Windows::Rows { x, stride }, block, workspace);
             out[first * targets..(first + block) * targets]
                 .copy_from_slice(&workspace.scaled[..block * targets]);
         }
-        workspace.panel = panel;
     }
 
     /// Estimates for a recording, the window sliding by one sample: one column of equal length per
@@ -500,23 +511,12 @@ impl Predictor {
         table.half_widths.get(class).copied()
     }
 
-    /// Windows in the form in which so many are estimated fastest, in `panel` if that is another.
-    fn arrange<'x>(&'x self, x: &'x [f32], stride: usize, rows: usize, panel: &'x mut [f32]) -> Windows<'x> {
-        if rows < MANY {
-            return Windows::Rows { x, stride };
-        }
-        panel::transpose(x, stride, rows, self.window_len(), panel);
-        Windows::Panel {
-            x: panel,
-            places: &self.places,
-        }
-    }
-
-    /// Estimates for at most [`PANEL`] windows, one row of scaled targets per window in
+    /// Estimates for at most [`ROWS`] windows, or [`PANEL`] side by side, one row of scaled targets per window in
     /// `workspace.scaled`.
     fn block(&self, windows: Windows<'_>, rows: usize, workspace: &mut Workspace) {
         let targets = self.targets.len();
         let Workspace {
+            panel,
             scaled,
             ping,
             pong,
@@ -531,19 +531,31 @@ impl Predictor {
         match windows {
             Windows::Rows { x, stride } => {
                 if let Some((layer, others)) = self.layers.split_first() {
-                    layer.forward(x, stride, rows, from);
+                    layer.forward_with(x, stride, rows, from, guide);
                     let mut width = layer.padded();
                     for layer in others {
                         layer.forward(from, width, rows, to);
                         width = layer.padded();
                         std::mem::swap(&mut from, &mut to);
                     }
-                    for (row, out) in scaled.chunks_mut(targets).enumerate() {
-                        out.copy_from_slice(&from[row * width..][..targets]);
+                    for (row, out) in scaled.chunks_exact_mut(targets).enumerate() {
+                        // Not by the library: a call for each row would be felt.
+                        for (slot, &value) in out.iter_mut().zip(&from[row * width..]) {
+                            *slot = value;
+                        }
                     }
                 }
                 if let Some(kernel) = &self.skip {
-                    kernel.add(x, stride, rows, skip, scaled);
+                    if kernel.is_narrow() || rows < MANY {
+                        kernel.add(x, stride, rows, skip, scaled);
+                    } else {
+                        for first in (0..rows).step_by(PANEL) {
+                            let (x, columns) = (&x[first * stride..], PANEL.min(rows - first));
+                            panel::transpose(x, stride, columns, self.window_len(), panel);
+                            let scaled = &mut scaled[first * targets..(first + columns) * targets];
+                            kernel.add_panel(panel, &self.places, columns, skip, scaled);
+                        }
+                    }
                 }
                 if let Some(kernel) = &self.guard {
                     kernel.limit(x, stride, rows, guide, scaled, limited);
@@ -552,6 +564,8 @@ impl Predictor {
             Windows::Panel { x, places } => {
                 if let Some((layer, others)) = self.layers.split_first() {
                     layer.forward_panel(x, places, rows, from);
+                    let (first, count) = (layer.outputs() * PANEL, layer.beside() * PANEL);
+                    guide[..count].copy_from_slice(&from[first..first + count]);
                     for layer in others {
                         layer.forward_panel(from, &self.places, rows, to);
                         std::mem::swap(&mut from, &mut to);

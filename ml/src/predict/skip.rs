@@ -1,7 +1,8 @@
 //! The skip connection in f64: coefficients that follow slow signals, see [`crate::scheduled`].
 //!
 //! Packed twice and computed in two ways, as [`super::kernel`] does in f32, with the same bits: many
-//! windows side by side, or few windows with outputs side by side. Every sum is made in four parts. f64
+//! windows side by side, or few windows with outputs side by side. Every sum is made in four parts, those of few
+//! outputs (constant coefficients have one for each target) in eight, which are the lanes where windows are rows. f64
 //! because the coefficients are large and act on small differences of neighbouring samples; the
 //! samples themselves are the scaled f32 values that the network takes, as in training. It costs
 //! little: a scheduled map has a twentieth of our own network's products.
@@ -27,6 +28,10 @@ const GROUP: usize = 8;
 const TILE: usize = 12;
 /// Parts of a sum.
 const PARTS: usize = 4;
+/// Outputs up to which there are more.
+const NARROW: usize = 4;
+/// Parts of such a sum.
+const NARROW_PARTS: usize = 8;
 
 /// A packed skip connection.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,7 +40,7 @@ pub struct SkipKernel {
     targets: usize,
     /// `[group][input][8]`.
     groups: Vec<[f64; GROUP]>,
-    /// `[tile][input][outputs of the tile]`.
+    /// `[tile][input][outputs of the tile]`; of few outputs `[output][input]`, filled up to whole parts.
     tiles: Vec<f64>,
     bias: Vec<f64>,
     slow: Vec<SlowSignal>,
@@ -66,10 +71,20 @@ impl SkipKernel {
         let outputs = map.bias.len();
         let inputs = map.weight.len() / outputs.max(1);
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
-        let mut groups = vec![[0.0; GROUP]; outputs.div_ceil(GROUP) * inputs];
-        let tiles = pack(&map.weight, outputs, TILE, |output, input, weight| {
-            groups[output / GROUP * inputs + input][output % GROUP] = weight;
-        });
+        let (groups, tiles) = if outputs <= NARROW {
+            let mut tiles = Vec::new();
+            for row in map.weight.chunks(inputs.max(1)) {
+                tiles.extend_from_slice(row);
+                tiles.resize(tiles.len().next_multiple_of(NARROW_PARTS), 0.0);
+            }
+            (Vec::new(), tiles)
+        } else {
+            let mut groups = vec![[0.0; GROUP]; outputs.div_ceil(GROUP) * inputs];
+            let tiles = pack(&map.weight, outputs, TILE, |output, input, weight| {
+                groups[output / GROUP * inputs + input][output % GROUP] = weight;
+            });
+            (groups, tiles)
+        };
         let mut bias = map.bias.clone();
         bias.resize(outputs.next_multiple_of(GROUP), 0.0);
         let slow = schedule.map_or_else(Vec::new, |schedule| {
@@ -110,6 +125,12 @@ impl SkipKernel {
     #[must_use]
     pub fn padded(&self) -> usize {
         self.bias.len()
+    }
+
+    /// Whether windows that are rows need not be turned into a panel, however many there are.
+    #[must_use]
+    pub fn is_narrow(&self) -> bool {
+        self.outputs() <= NARROW
     }
 
     fn outputs(&self) -> usize {
@@ -226,6 +247,19 @@ impl SkipKernel {
     /// Lengths were compared by the caller.
     #[inline(always)]
     unsafe fn many<S: Simd>(map: &Self, x: &[f32], places: &[usize], columns: usize, out: &mut [f64]) {
+        if map.is_narrow() {
+            for output in 0..map.outputs() {
+                for column in (0..columns).step_by(S::LANES / 2) {
+                    map.narrow_column::<S>(
+                        output,
+                        x.as_ptr().add(column),
+                        places,
+                        out.as_mut_ptr().add(column),
+                    );
+                }
+            }
+            return;
+        }
         for first in (0..map.outputs()).step_by(TILE) {
             let width = TILE.min(map.outputs() - first);
             for column in (0..columns).step_by(S::LANES) {
@@ -315,6 +349,25 @@ impl SkipKernel {
     /// Lengths were compared by the caller.
     #[inline(always)]
     unsafe fn few<S: Simd>(map: &Self, x: &[f32], stride: usize, rows: usize, out: &mut [f64]) {
+        if map.is_narrow() {
+            let mut row = 0;
+            while row < rows {
+                let (from, to) = (
+                    x.as_ptr().add(row * stride),
+                    out.as_mut_ptr().add(row * map.padded()),
+                );
+                let is_block = rows - row >= S::ROWS;
+                for output in 0..map.outputs() {
+                    match (is_block, S::ROWS) {
+                        (true, 6) => map.narrow_rows::<S, 6>(output, from, stride, to),
+                        (true, _) => map.narrow_rows::<S, 4>(output, from, stride, to),
+                        _ => map.narrow_rows::<S, 1>(output, from, stride, to),
+                    }
+                }
+                row += if is_block { S::ROWS } else { 1 };
+            }
+            return;
+        }
         let half = S::LANES / 2;
         for row in 0..rows {
             let x = x.as_ptr().add(row * stride);
@@ -351,6 +404,102 @@ impl SkipKernel {
                     S::add_f64(sum, bias),
                 );
             }
+        }
+    }
+
+    /// One of few outputs for one vector of columns.
+    #[inline(always)]
+    unsafe fn narrow_column<S: Simd>(&self, output: usize, x: *const f32, places: &[usize], out: *mut f64) {
+        let mut sums = [S::splat_f64(0.0); NARROW_PARTS];
+        let stride = self.inputs.next_multiple_of(NARROW_PARTS);
+        let mut weights = self.tiles.as_ptr().add(output * stride);
+        let (whole, rest) = places.as_chunks::<NARROW_PARTS>();
+        for places in whole {
+            for part in 0..NARROW_PARTS {
+                let value = S::widen(x.add(places[part]));
+                sums[part] = S::fma_f64(S::splat_f64(*weights.add(part)), value, sums[part]);
+            }
+            weights = weights.add(NARROW_PARTS);
+        }
+        for (part, &place) in rest.iter().enumerate() {
+            let value = S::widen(x.add(place));
+            sums[part] = S::fma_f64(S::splat_f64(*weights.add(part)), value, sums[part]);
+        }
+        // As halves of a vector are added, see `Simd::sum`.
+        for half in [4, 2, 1] {
+            for part in 0..half {
+                sums[part] = S::add_f64(sums[part], sums[part + half]);
+            }
+        }
+        let bias = S::splat_f64(self.bias[output]);
+        S::store_f64(out.add(output * PANEL), S::add_f64(sums[0], bias));
+    }
+
+    /// One of few outputs for R rows.
+    #[inline(always)]
+    unsafe fn narrow_rows<S: Simd, const R: usize>(
+        &self,
+        output: usize,
+        x: *const f32,
+        stride: usize,
+        out: *mut f64,
+    ) {
+        let weights = self
+            .tiles
+            .as_ptr()
+            .add(output * self.inputs.next_multiple_of(NARROW_PARTS));
+        let mut totals = [0.0; R];
+        match S::LANES {
+            16 => self.dots::<S, R, 1>(weights, x, stride, &mut totals),
+            8 => self.dots::<S, R, 2>(weights, x, stride, &mut totals),
+            _ => self.dots::<S, R, 4>(weights, x, stride, &mut totals),
+        }
+        for r in 0..R {
+            *out.add(r * self.padded() + output) = totals[r] + self.bias[output];
+        }
+    }
+
+    /// `weights · row` for R rows, in [`NARROW_PARTS`] parts, V vectors of them.
+    #[inline(always)]
+    unsafe fn dots<S: Simd, const R: usize, const V: usize>(
+        &self,
+        weights: *const f64,
+        x: *const f32,
+        stride: usize,
+        totals: &mut [f64; R],
+    ) {
+        let half = S::LANES / 2;
+        let mut sums = [[S::splat_f64(0.0); V]; R];
+        let whole = self.inputs - self.inputs % NARROW_PARTS;
+        for input in (0..whole).step_by(NARROW_PARTS) {
+            for v in 0..V {
+                let lanes = S::load_f64(weights.add(input + v * half));
+                for r in 0..R {
+                    let values = S::widen(x.add(r * stride + input + v * half));
+                    sums[r][v] = S::fma_f64(lanes, values, sums[r][v]);
+                }
+            }
+        }
+        for v in 0..V {
+            let input = whole + v * half;
+            if input < self.inputs {
+                let count = (self.inputs - input).min(half);
+                let lanes = S::load_f64(weights.add(input));
+                for r in 0..R {
+                    let values = S::widen_first(x.add(r * stride + input), count);
+                    sums[r][v] = S::fma_f64(lanes, values, sums[r][v]);
+                }
+            }
+        }
+        for r in 0..R {
+            let mut count = V / 2;
+            while count > 0 {
+                for v in 0..count {
+                    sums[r][v] = S::add_f64(sums[r][v], sums[r][v + count]);
+                }
+                count /= 2;
+            }
+            totals[r] = S::sum_f64(sums[r][0]);
         }
     }
 }
@@ -426,6 +575,43 @@ mod tests {
             kernel.add_at(level, &x, 2, rows, &mut scratch, &mut few);
             kernel.add_panel_at(level, &panel, &places, rows, &mut scratch, &mut many);
             assert_eq!(few, many, "{level:?}");
+        }
+    }
+
+    #[test]
+    fn constant_coefficients_agree_with_the_definition_and_have_the_same_bits_both_ways() {
+        for (size, targets, rows) in [(300, 1, 32), (37, 3, 9), (8, 4, 1), (5, 2, 17)] {
+            let value = |i: usize| ((i * 2_654_435_761) % 1000) as f64 / 500.0 - 1.0;
+            let map = SkipWeights {
+                weight: (0..targets * size).map(value).collect(),
+                bias: (900..900 + targets).map(value).collect(),
+            };
+            let kernel = SkipKernel::new(&map, None, &[channel(0.0, 1.0)], targets);
+            assert!(kernel.is_narrow());
+            let x: Vec<f32> = (300..300 + rows * size).map(|i| value(i) as f32).collect();
+            let mut panel = vec![f32::NAN; size * PANEL];
+            super::super::panel::transpose(&x, size, rows, size, &mut panel);
+            let places: Vec<usize> = (0..size).map(|i| i * PANEL).collect();
+            for level in [level(), Level::Avx2, Level::Portable] {
+                if level == Level::Avx2 && super::level() == Level::Portable {
+                    continue;
+                }
+                let (mut few, mut many) = (vec![1.0; rows * targets], vec![1.0; rows * targets]);
+                let mut scratch = vec![0.0; PANEL * kernel.padded()];
+                kernel.add_at(level, &x, size, rows, &mut scratch, &mut few);
+                kernel.add_panel_at(level, &panel, &places, rows, &mut scratch, &mut many);
+                assert_eq!(few, many, "{level:?}");
+                for (place, &found) in few.iter().enumerate() {
+                    let (row, t) = (place / targets, place % targets);
+                    let expected: f64 = (0..size)
+                        .map(|i| map.weight[t * size + i] * f64::from(x[row * size + i]))
+                        .sum::<f64>()
+                        + map.bias[t]
+                        + 1.0;
+                    // A sum in f64, rounded to f32; it is below 300.
+                    assert!((f64::from(found) - expected).abs() < 2e-5, "{level:?}, row {row}");
+                }
+            }
         }
     }
 }

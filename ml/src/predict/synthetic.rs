@@ -238,6 +238,7 @@ fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> Mod
 mod tests {
     use super::super::sliding::SlidingWindow;
     use super::*;
+    use hydroflex_openapi::model::Schedule;
 
     fn model(structure: &str) -> SyntheticModel {
         SyntheticModel::new(&SyntheticSpec {
@@ -348,17 +349,41 @@ mod tests {
             .collect()
     }
 
+    /// A skip connection whose coefficients follow the second input.
+    fn scheduled() -> SyntheticModel {
+        let mut model = model("best");
+        let skip = model.weights.skip.as_mut().unwrap();
+        let terms = |of: &[f64]| -> Vec<f64> {
+            [1.0, 0.3, -0.2]
+                .iter()
+                .flat_map(|factor| of.iter().map(move |value| factor * value))
+                .collect()
+        };
+        *skip = SkipWeights {
+            weight: terms(&skip.weight),
+            bias: terms(&skip.bias),
+        };
+        model.config.schedule = Some(Schedule {
+            inputs: vec![1],
+            centre: vec![1.05],
+            half_range: vec![0.1],
+            exponents: vec![vec![0], vec![1], vec![2]],
+        });
+        model
+    }
+
     #[test]
     fn an_estimate_has_the_same_bits_whatever_stands_beside_it() {
-        for structure in ["L", "RLR", "TLTLT", "ELE", "best"] {
-            let predictor = model(structure).predictor();
+        let models = ["L", "RLR", "TLTLT", "ELE", "best"].map(model);
+        for (number, model) in models.into_iter().chain([scheduled()]).enumerate() {
+            let predictor = model.predictor();
             let mut workspace = predictor.workspace();
-            let samples = signal(0, 12 * 45);
-            let mut alone = vec![0.0; 45 * 3];
+            let samples = signal(0, 12 * 130);
+            let mut alone = vec![0.0; 130 * 3];
             for (window, out) in samples.chunks(60).zip(alone.chunks_mut(3)) {
                 predictor.predict_window(window, out, &mut workspace);
             }
-            for count in [2, 7, 8, 16, 33, 45] {
+            for count in [2, 7, 8, 16, 33, 45, 48, 49, 130] {
                 let mut together = vec![0.0; count * 3];
                 let mut inside = vec![false; count];
                 predictor.predict_windows_with(
@@ -367,8 +392,19 @@ mod tests {
                     Some(&mut inside),
                     &mut workspace,
                 );
-                assert_eq!(together, alone[..count * 3], "{structure}, {count} windows");
+                assert_eq!(together, alone[..count * 3], "model {number}, {count} windows");
                 assert!(inside.iter().all(|inside| *inside));
+            }
+            // The same windows, overlapping: those of a recording.
+            let columns: Vec<Vec<f64>> = (0..5)
+                .map(|input| samples.iter().skip(input).step_by(5).copied().collect())
+                .collect();
+            let columns: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+            let series = predictor.predict_series_with(&columns, &mut workspace);
+            for (window, row) in alone.chunks(3).enumerate() {
+                for (target, value) in row.iter().enumerate() {
+                    assert_eq!(*value, series.columns[target][12 * window], "model {number}");
+                }
             }
         }
     }

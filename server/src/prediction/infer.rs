@@ -3,7 +3,7 @@
 //! A body is JSON, or JSON of a length given in a header followed by the tensors' bytes in the
 //! order in which the JSON names them. Everything is checked before anything is computed.
 
-use super::LoadedModel;
+use super::{LoadedModel, numbers};
 use hydroflex_ml::predict::Predictor;
 use hydroflex_openapi::model::ModelConfig;
 use serde::de::{Deserializer, SeqAccess, Visitor};
@@ -15,8 +15,6 @@ pub const HEADER_LENGTH: &str = "inference-header-content-length";
 /// Name of the tensor in.
 pub const WINDOW: &str = "window";
 
-/// Values that room is made for before any is read.
-const USUAL_VALUES: usize = 512;
 /// Dimensions that `data` may be nested in: batch, steps, inputs.
 const DEEPEST: usize = 3;
 
@@ -147,8 +145,7 @@ struct Flat(Vec<f64>);
 
 impl<'de> Deserialize<'de> for Flat {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // As many as a usual window has: growing from nothing would move them ten times.
-        let mut values = Vec::with_capacity(USUAL_VALUES);
+        let mut values = Vec::new();
         let list = List {
             values: &mut values,
             depth: 1,
@@ -248,8 +245,16 @@ pub fn read(
             body.len()
         ));
     };
-    let request: Request<'_> = serde_json::from_slice(json)
-        .map_err(|error| format!("the request is not what the protocol says: {error}"))?;
+    let (rest, values) = numbers::apart(json, DEEPEST).unzip();
+    let request = match rest.as_deref().and_then(without_values).zip(values) {
+        Some((mut request, values)) => {
+            request.inputs[0].data = Some(Flat(values));
+            request
+        }
+        // Whole, as it is: also for whoever is told what is wrong with it and where.
+        None => serde_json::from_slice(json)
+            .map_err(|error| format!("the request is not what the protocol says: {error}"))?,
+    };
     let [input] = <[Input<'_>; 1]>::try_from(request.inputs).map_err(|inputs| {
         let names: Vec<_> = inputs.iter().map(|input| input.name.as_ref()).collect();
         format!("inputs are {names:?}; the model takes one, {WINDOW:?}")
@@ -271,6 +276,13 @@ pub fn read(
     };
     check_values(&batch, predictor, config)?;
     Ok(batch)
+}
+
+/// A request whose numbers were read apart: in place of those of its one input stands an empty array.
+fn without_values(json: &[u8]) -> Option<Request<'_>> {
+    let request: Request<'_> = serde_json::from_slice(json).ok()?;
+    let is_empty = |input: &Input<'_>| input.data.as_ref().is_some_and(|Flat(values)| values.is_empty());
+    matches!(request.inputs.as_slice(), [input] if is_empty(input)).then_some(request)
 }
 
 fn batch_size(shape: &[u64], predictor: &Predictor) -> Result<usize, String> {

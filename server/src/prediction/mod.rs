@@ -5,6 +5,7 @@
 //! - `columns`: which column of a request is which input
 //! - `table`: recordings of any length as Arrow or Parquet, a batch of rows at a time
 //! - `infer`: the Open Inference Protocol's tensors
+//! - `numbers`: the numbers of their JSON
 //! - `session`: a live signal, one sample at a time
 //! - `gate`: how much is done at once, and what is refused
 //!
@@ -16,6 +17,7 @@ pub mod answer;
 pub mod table;
 pub mod spool;
 pub mod infer;
+mod numbers;
 pub mod session;
 pub mod gate;
 
