@@ -715,13 +715,18 @@ mod tests {
                     layer.forward_panel_at(level, &panel, &places, rows, &mut out);
                     for row in 0..rows {
                         for output in 0..outputs {
-                            let value = found[row * layer.padded() + output];
-                            assert_eq!(value, expected[row * alone.padded() + output], "{level:?}");
-                            assert_eq!(value, out[output * PANEL + row], "{level:?}");
+                            let bits = found[row * layer.padded() + output].to_bits();
+                            let expected = expected[row * alone.padded() + output];
+                            assert_eq!(bits, expected.to_bits(), "{level:?}");
+                            assert_eq!(bits, out[output * PANEL + row].to_bits(), "{level:?}");
                         }
                         for b in 0..beside {
                             let value = found_beside[row * beside + b];
-                            assert_eq!(value, out[(outputs + b) * PANEL + row], "{level:?}");
+                            assert_eq!(
+                                value.to_bits(),
+                                out[(outputs + b) * PANEL + row].to_bits(),
+                                "{level:?}"
+                            );
                             let z: f64 = (0..inputs)
                                 .map(|i| {
                                     f64::from(other.weight[b * inputs + i]) * f64::from(x[row * inputs + i])
