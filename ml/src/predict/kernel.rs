@@ -142,7 +142,7 @@ impl PackedLayer {
     #[must_use]
     pub fn has_room(outputs: usize, beside: usize) -> bool {
         outputs + beside <= NARROW
-            || (outputs > NARROW && outputs % GROUP + beside <= GROUP && outputs % GROUP > 0)
+            || (outputs > NARROW && outputs % GROUP + beside <= GROUP && !outputs.is_multiple_of(GROUP))
     }
 
     /// Values in.
@@ -208,6 +208,10 @@ impl PackedLayer {
         );
         assert!(out.len() >= rows * self.padded(), "room for {rows} rows");
         let beside = beside.unwrap_or_default();
+        assert!(
+            beside.is_empty() || beside.len() >= rows * self.beside,
+            "room beside {rows} rows"
+        );
         let layer = self;
         dispatch!(level, PackedLayer::rows(layer: &PackedLayer, x: &[f32], stride: usize, rows: usize, out: &mut [f32], beside: &mut [f32]));
     }
@@ -434,8 +438,9 @@ impl PackedLayer {
                 1
             };
         }
-        if layer.beside > 0 {
-            for row in 0..rows.min(beside.len() / layer.beside) {
+        // By hand: a copy by the library, or one that the compiler makes vectors of, takes longer than the values' layer.
+        if beside.len() >= rows * layer.beside {
+            for row in 0..rows {
                 for place in 0..layer.beside {
                     *beside.as_mut_ptr().add(row * layer.beside + place) =
                         *to.add(row * layer.padded() + layer.outputs() + place);
@@ -715,13 +720,18 @@ mod tests {
                     layer.forward_panel_at(level, &panel, &places, rows, &mut out);
                     for row in 0..rows {
                         for output in 0..outputs {
-                            let value = found[row * layer.padded() + output];
-                            assert_eq!(value, expected[row * alone.padded() + output], "{level:?}");
-                            assert_eq!(value, out[output * PANEL + row], "{level:?}");
+                            let bits = found[row * layer.padded() + output].to_bits();
+                            let expected = expected[row * alone.padded() + output];
+                            assert_eq!(bits, expected.to_bits(), "{level:?}");
+                            assert_eq!(bits, out[output * PANEL + row].to_bits(), "{level:?}");
                         }
                         for b in 0..beside {
                             let value = found_beside[row * beside + b];
-                            assert_eq!(value, out[(outputs + b) * PANEL + row], "{level:?}");
+                            assert_eq!(
+                                value.to_bits(),
+                                out[(outputs + b) * PANEL + row].to_bits(),
+                                "{level:?}"
+                            );
                             let z: f64 = (0..inputs)
                                 .map(|i| {
                                     f64::from(other.weight[b * inputs + i]) * f64::from(x[row * inputs + i])
