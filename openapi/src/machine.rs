@@ -55,7 +55,8 @@ pub struct Conventions {
     pub gravity_moment: GravityMoment,
     /// How a marker's angular velocity combines rigid and modal rotation.
     pub marker_rotation: MarkerRotation,
-    /// Where the static start of the fixed-step schemes ends; absent: at rest to rounding.
+    /// Where the static start of runs in redundant coordinates ends (the fixed-step schemes, and `accurate` where it has no
+    /// minimal coordinates); absent: at rest to rounding.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub statics: Option<LooseStatics>,
 }

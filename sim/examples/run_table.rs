@@ -12,7 +12,16 @@ use hydroflex_openapi::job::Integrator;
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::{RunInput, RunSettings};
+use nix::sys::resource::{UsageWho, getrusage};
+use nix::sys::time::TimeValLike;
 use serde_json::{Value, json};
+
+/// User time of this thread, µs.
+fn processor_us() -> nix::Result<i64> {
+    // Linux brings a running thread's account up to date at ticks of some milliseconds, and when it yields.
+    std::thread::yield_now();
+    Ok(getrusage(UsageWho::RUSAGE_THREAD)?.user_time().num_microseconds())
+}
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -48,13 +57,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 .collect(),
         };
         simulator.prepare(input.payload_kg > 0.0)?;
-        let start = Instant::now();
+        let (start, processor_start_us) = (Instant::now(), processor_us()?);
         let result = simulator.run(&input, &settings);
         let spent_s = start.elapsed().as_secs_f64();
+        let processor_ms = 1e-3 * (processor_us()? - processor_start_us) as f64;
         match result {
             Ok(run) => {
                 println!(
-                    "run {}: {:.2} ms, {:?} {:?}",
+                    "run {}: {:.2} ms ({processor_ms:.2} ms of the processor), {:?} {:?}",
                     input.run_id,
                     1e3 * spent_s,
                     run.flags,

@@ -92,11 +92,11 @@ pub fn equilibrium(
     settle(system, file, angles_rad, None, ws)
 }
 
-/// Where the fixed-step schemes start: the equilibrium, or where `conventions.statics` stops short of it.
+/// Where runs of the general path start: the equilibrium, or where `conventions.statics` stops short of it.
 ///
 /// # Errors
 /// As [`equilibrium`].
-pub(crate) fn fixed_step_start(
+pub(crate) fn general_start(
     system: &System,
     file: &MachineFile,
     angles_rad: &[f64],

@@ -15,6 +15,9 @@ const SPECTRAL_RADIUS: f64 = 0.7;
 const STEP_LONGEST_S: f64 = 1.01e-3;
 /// Shortest one, s. Runs whose valve chatters at the stroke cut-off never settle; they end here.
 const STEP_SHORTEST_S: f64 = 1e-5;
+/// Steps into which every step of the first sample is cut where the start is not at rest: what is left of the static
+/// solution settles faster than anything that follows, and would alone decide the step of the whole run.
+const FIRST_SAMPLE_PARTS: u32 = 16;
 /// Largest change of a channel between the last two step sizes, relative to the channel's range, at which the two are extrapolated.
 /// Halving the step of a second-order scheme leaves a third of that change as error; the extrapolation takes most
 /// of it away (nine tenths on the published crane, two thirds are needed for 1e-3).
@@ -37,6 +40,8 @@ pub(crate) struct GeneralRun<'a> {
 #[derive(Debug, Clone, Copy)]
 struct Grid {
     steps_per_sample: u32,
+    /// The same in the first sample.
+    steps_first: u32,
     /// Also where a valve signal crosses zero: there the metering edge changes, and a step across
     /// that kink would lose the scheme's order.
     split_at_zero: bool,
@@ -47,6 +52,7 @@ impl GeneralRun<'_> {
     pub(crate) fn fixed(&self, scheme: Scheme, steps_per_sample: u32) -> Result<Trajectory, RunFailure> {
         let grid = Grid {
             steps_per_sample,
+            steps_first: steps_per_sample,
             split_at_zero: false,
         };
         self.march(scheme, Newton::EXACT, grid)
@@ -65,9 +71,14 @@ impl GeneralRun<'_> {
             reason = "small and positive"
         )]
         let mut steps = (self.sample_time_s / STEP_LONGEST_S).ceil().clamp(1.0, 1e6) as u32;
+        let first_parts = match self.system.conventions.statics {
+            Some(_) => FIRST_SAMPLE_PARTS,
+            None => 1,
+        };
         let march = |steps_per_sample| {
             let grid = Grid {
                 steps_per_sample,
+                steps_first: steps_per_sample * first_parts,
                 split_at_zero: true,
             };
             self.march(scheme, Newton::FRUGAL, grid)
@@ -111,7 +122,7 @@ impl GeneralRun<'_> {
         let mut columns = self.recorder.new_columns(samples + 1);
         let mut flags = FlagSet::default();
         let (mut from, mut to) = (vec![0.0; cylinders.len()], vec![0.0; cylinders.len()]);
-        let mut ends = Vec::with_capacity(2 * grid.steps_per_sample as usize + 2 * cylinders.len() + 2);
+        let mut ends = Vec::with_capacity(2 * grid.steps_first as usize + 2 * cylinders.len() + 2);
         let mut stepper = Stepper::with_newton(self.system, scheme, newton, self.start.clone())?;
         let record = |stepper: &Stepper<'_>, sample, columns: &mut Vec<Vec<f64>>| {
             let valves = |k| self.valve(k, sample);
@@ -158,8 +169,13 @@ impl GeneralRun<'_> {
     /// Ends of the steps of a sample, as parts of it: ascending, the last one is 1.
     fn step_ends(&self, grid: Grid, sample: usize, ends: &mut Vec<f64>) {
         ends.clear();
-        let total = f64::from(grid.steps_per_sample);
-        ends.extend((1..grid.steps_per_sample).map(|k| f64::from(k) / total));
+        let steps = if sample == 1 {
+            grid.steps_first
+        } else {
+            grid.steps_per_sample
+        };
+        let total = f64::from(steps);
+        ends.extend((1..steps).map(|k| f64::from(k) / total));
         ends.push(1.0);
         if grid.split_at_zero {
             for k in 0..self.valves_ratio.len() {

@@ -7,7 +7,7 @@ use hydroflex_openapi::channel::Channel;
 use hydroflex_openapi::job::{Integrator, SolverPath};
 use hydroflex_openapi::machine::MachineFile;
 
-use crate::equilibrium::{Equilibrium, equilibrium, fixed_step_start, start_lengths_m};
+use crate::equilibrium::{Equilibrium, equilibrium, general_start, start_lengths_m};
 use crate::fast::{self, NotPlanar, PlanarModel};
 use crate::general::GeneralRun;
 use crate::integrate::Scheme;
@@ -290,11 +290,7 @@ impl Simulator {
             );
         }
         let system = variant.system.with_payload_mass(input.payload_kg);
-        let find_start = match settings.integrator {
-            Integrator::Accurate => equilibrium,
-            Integrator::TrapezoidalIndex2 { .. } | Integrator::GeneralizedAlpha { .. } => fixed_step_start,
-        };
-        let start = find_start(
+        let start = general_start(
             &system,
             self.machine.file(),
             &input.angles_rad,
