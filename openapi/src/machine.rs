@@ -56,7 +56,7 @@ pub struct Conventions {
     /// How a marker's angular velocity combines rigid and modal rotation.
     pub marker_rotation: MarkerRotation,
     /// Where the static start of runs in redundant coordinates ends (the fixed-step schemes, and `accurate` where it has no
-    /// minimal coordinates); absent: at rest to rounding.
+    /// minimal coordinates). Absent, and in runs whose valves stay shut: at rest to rounding.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub statics: Option<LooseStatics>,
 }

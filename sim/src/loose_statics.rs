@@ -469,7 +469,7 @@ impl Direction {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::equilibrium::{equilibrium, fixed_step_start};
+    use crate::equilibrium::{equilibrium, general_start};
     use crate::testing::{closed_crane, linkage, random_state};
     use hydroflex_openapi::machine::GravityMoment;
 
@@ -525,7 +525,7 @@ mod tests {
             let system = System::new(&file, &reduced, 50.0).unwrap();
             let mut ws = system.new_workspace();
             let exact = equilibrium(&system, &file, &[0.3, 0.1], &mut ws).unwrap();
-            let found = fixed_step_start(&system, &file, &[0.3, 0.1], &mut ws).unwrap();
+            let found = general_start(&system, &file, &[0.3, 0.1], &mut ws).unwrap();
             let pairs = found.state.q.iter().zip(&exact.state.q);
             pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };

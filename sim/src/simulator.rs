@@ -290,7 +290,10 @@ impl Simulator {
             );
         }
         let system = variant.system.with_payload_mass(input.payload_kg);
-        let start = general_start(
+        // What is held rests: the loose start belongs to runs that move, where its transient is part of the answer.
+        let is_held = input.valves_ratio.iter().flatten().all(|ratio| *ratio == 0.0);
+        let find_start = if is_held { equilibrium } else { general_start };
+        let start = find_start(
             &system,
             self.machine.file(),
             &input.angles_rad,

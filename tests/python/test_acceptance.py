@@ -30,14 +30,13 @@ CASES = [
 # solution of tolerance 1e-4, which ours share. b, run 9: the reference accepted one unconverged step (340: it
 # misses the pressure law there by 2e5 Pa, elsewhere by 0.01 Pa). b, runs 3, 5, 6 and 8: the difference of the tilt
 # cylinder's velocity, 4e-9 m/s else, jumps to 5e-7 … 5e-6 in a single step and decays; ours is
-# converged to increments of 1e-6 m/s², the reference to 1e-8 of a first residual of 5e4 N. b, runs 13 and 14, valve shut: the loose start is not quite
-# still, the reference's tip drifts by 8.9e-7 and 8.3e-7 m as ours does, which the judge's bound of 5e-7 m excludes.
-# c, runs 13 and 14, valve shut: the reference's own tip drifts by 7.0e-7 and 6.9e-7 m from the same start, as ours does.
+# converged to increments of 1e-6 m/s², the reference to 1e-8 of a first residual of 5e4 N. Runs 13 and 14, valves shut, start
+# at rest: from its own start the reference's tip drifts by 7e-7 to 9e-7 m, where the judge allows 5e-7 m.
 CRANE = [
     ([], "trapezoidal-index-2", "a", "1e-5", "1e-3"),
-    (all_but(15, 3, 5, 6, 8, 9, 13, 14), "generalized-alpha", "b", "1e-5", "1e-3"),
+    (all_but(15, 3, 5, 6, 8, 9), "generalized-alpha", "b", "1e-5", "1e-3"),
     (["--run-ids", "3,5,6,8"], "generalized-alpha", "b", "2e-4", "1e-3"),
-    (all_but(15, 13, 14), "accurate", "c", "1e-3", "1e-3"),
+    ([], "accurate", "c", "1e-3", "1e-3"),
 ]
 
 
