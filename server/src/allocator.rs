@@ -27,7 +27,8 @@ extern "C" fn count_what_is_used() {
 #[unsafe(link_section = ".init_array")]
 static BEFORE_MAIN: extern "C" fn() = count_what_is_used;
 
-#[cfg(all(test, target_os = "linux"))]
+#[cfg(test)]
+#[cfg(target_os = "linux")]
 mod tests {
     /// A field of `/proc/self/status`, in bytes.
     fn status(field: &str) -> u64 {
