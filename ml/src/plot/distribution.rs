@@ -130,7 +130,12 @@ impl Panel {
             escape(&self.name),
             left + width,
             top - 5.0,
-            significant(self.mean),
+            // What rounding leaves of a mean that was taken away.
+            significant(if self.mean.abs() < 1e-9 * self.std {
+                0.0
+            } else {
+                self.mean
+            }),
             significant(self.std)
         )?;
         if self.density.is_empty() {

@@ -163,6 +163,9 @@ fn readable(name: &str) -> String {
             ..,
         ] => format!("{place} {quantity} {component}"),
         ["valve", cylinder, ..] => format!("{cylinder} valve"),
+        [quantity @ ("length" | "velocity"), cylinder, ..] => format!("{cylinder} cylinder's {quantity}"),
+        ["pressure", cylinder, side, ..] => format!("{cylinder} cylinder's pressure, {side} side"),
+        ["angle", joint, ..] => format!("{joint} angle"),
         _ => name.to_owned(),
     };
     let mut letters = text.chars();
