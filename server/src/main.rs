@@ -76,8 +76,46 @@ fn main() -> std::process::ExitCode {
     match result {
         Ok(()) => std::process::ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", one_line(&error));
             std::process::ExitCode::FAILURE
         }
+    }
+}
+
+/// An error and its causes, outermost first. A cause that the text before it quotes already is left out: some libraries
+/// print theirs, and name it too.
+fn one_line(error: &anyhow::Error) -> String {
+    let mut line = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if line.is_empty() {
+            line = cause;
+        } else if !line.contains(&cause) {
+            line.push_str(": ");
+            line.push_str(&cause);
+        }
+    }
+    line
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context as _;
+
+    #[test]
+    fn a_cause_that_was_quoted_is_not_printed_again() {
+        let inner = std::io::Error::other("refused");
+        let quoting = anyhow::anyhow!("GET failed: {inner}");
+        let error = Err::<(), _>(inner)
+            .context(quoting.to_string())
+            .context("the store does not answer")
+            .unwrap_err();
+        assert_eq!(
+            super::one_line(&error),
+            "the store does not answer: GET failed: refused"
+        );
+        let error = Err::<(), _>(std::io::Error::other("no space"))
+            .context("cannot write x")
+            .unwrap_err();
+        assert_eq!(super::one_line(&error), "cannot write x: no space");
     }
 }

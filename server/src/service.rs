@@ -4,8 +4,8 @@ use crate::coordinator::supervise::{SuperviseConfig, Supervisor};
 use crate::coordinator::{Coordinator, CoordinatorConfig};
 use crate::http::{self, AppState};
 use anyhow::Context;
-use hydroflex_ledger::Ledger;
 use hydroflex_ledger::blobs::Blobs;
+use hydroflex_ledger::{Ledger, clock};
 use hydroflex_worker::shard_loop::RunLimits;
 use nix::fcntl::{Flock, FlockArg};
 use std::fs::File;
@@ -134,6 +134,19 @@ pub async fn start(config: ServiceConfig, listener: TcpListener) -> anyhow::Resu
     let mut state = AppState::new(coordinator.clone());
     if config.keys {
         state = state.behind_keys();
+        let now_ms = clock::now_ms();
+        if state
+            .ledger()
+            .keys()
+            .await?
+            .iter()
+            .all(|key| key.ended(now_ms).is_some())
+        {
+            tracing::warn!(
+                "every request needs a key, and there is none: `hydroflex key create --scopes submit,read,predict` \
+                 with the same --data or --database makes one"
+            );
+        }
     }
     let stop = CancellationToken::new();
     let supervisor = Supervisor::start(SuperviseConfig {
@@ -217,7 +230,8 @@ pub async fn until_told_to_stop() -> std::io::Result<()> {
 }
 
 fn prepare_directory(data: &Path) -> anyhow::Result<PathBuf> {
-    std::fs::create_dir_all(data).with_context(|| format!("cannot make {}", data.display()))?;
+    std::fs::create_dir_all(data)
+        .with_context(|| format!("cannot make {}; --data takes another directory", data.display()))?;
     // Workers may run elsewhere: they get absolute paths.
     data.canonicalize()
         .with_context(|| format!("cannot find {}", data.display()))

@@ -4,7 +4,7 @@
 //! `RETURNING`, `ON CONFLICT`); [`Engine`] tells the few places where they differ.
 
 use crate::LedgerError;
-use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
 };
@@ -173,6 +173,14 @@ macro_rules! bind_all {
     }};
 }
 
+/// What a single attempt to reach PostgreSQL ends with.
+async fn why_not(url: &str) -> sqlx::Error {
+    match tokio::time::timeout(Duration::from_secs(5), PgConnection::connect(url)).await {
+        Ok(Err(error)) => error,
+        Ok(Ok(_)) | Err(_) => sqlx::Error::PoolTimedOut,
+    }
+}
+
 impl Pool {
     /// Connects; `sqlite:PATH` and `sqlite://PATH` make the file if it is absent.
     pub(crate) async fn connect(url: &str, connections: u32) -> Result<Self, LedgerError> {
@@ -203,8 +211,13 @@ impl Pool {
                     Box::pin(async move { connection.execute(GIVE_UP_THE_SILENT).await.map(drop) })
                 })
                 .connect(url)
-                .await?;
-            Ok(Self::Postgres(pool))
+                .await;
+            match pool {
+                Ok(pool) => Ok(Self::Postgres(pool)),
+                // The pool has tried again and again, and does not say what stood in the way.
+                Err(sqlx::Error::PoolTimedOut) => Err(why_not(url).await.into()),
+                Err(error) => Err(error.into()),
+            }
         } else {
             // The URL may hold a password: only its scheme is repeated.
             let scheme = url.split(':').next().unwrap_or_default().to_owned();

@@ -58,7 +58,7 @@ pub struct Args {
     #[arg(long, default_value_t = 80)]
     pub runs: u64,
     /// Worker processes (default: one per core)
-    #[arg(long)]
+    #[arg(long, value_parser = super::at_once(1))]
     pub workers: Option<usize>,
     /// Stop when the chain is done instead of serving on
     #[arg(long)]

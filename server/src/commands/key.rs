@@ -116,8 +116,12 @@ async fn open(args: &LedgerArgs) -> anyhow::Result<Ledger> {
     let url = if let Some(url) = &args.database {
         url.clone()
     } else {
-        std::fs::create_dir_all(&args.data)
-            .with_context(|| format!("cannot make {}", args.data.display()))?;
+        std::fs::create_dir_all(&args.data).with_context(|| {
+            format!(
+                "cannot make {}; --data names the service's directory",
+                args.data.display()
+            )
+        })?;
         format!("sqlite:{}", args.data.join("ledger.sqlite").display())
     };
     Ledger::create(&url).await.context("cannot open the database")

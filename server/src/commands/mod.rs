@@ -24,8 +24,17 @@ pub mod paper;
 mod log;
 
 use anyhow::Context as _;
+use clap::builder::RangedU64ValueParser;
 use std::io::Write as _;
 use std::path::Path;
+
+/// Threads or processes at once: more than any one machine has use for would only take its memory.
+const MOST_AT_ONCE: u64 = 1024;
+
+/// Reads a number of threads or processes, `least` to [`MOST_AT_ONCE`].
+fn at_once(least: u64) -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(least..=MOST_AT_ONCE)
+}
 
 /// The text of a file, or of standard input for `-`; `what` says in an error what it is.
 ///

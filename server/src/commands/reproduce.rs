@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Threads (default: one per core)
-    #[arg(long)]
+    #[arg(long, value_parser = super::at_once(1))]
     pub threads: Option<usize>,
     /// Directory for reduced bodies (default: a folder of the user's cache directory)
     #[arg(long)]

@@ -19,10 +19,10 @@ pub struct Args {
     #[arg(long, env = "HYDROFLEX_CACHE")]
     pub cache: Option<PathBuf>,
     /// Local worker processes (default: one per core; 0 for none)
-    #[arg(long)]
+    #[arg(long, value_parser = super::at_once(0))]
     pub workers: Option<usize>,
     /// Local trainer processes, which share the cores: trainings that go on at once (0 for none)
-    #[arg(long, default_value_t = 1, env = "HYDROFLEX_TRAINERS")]
+    #[arg(long, default_value_t = 1, env = "HYDROFLEX_TRAINERS", value_parser = super::at_once(0))]
     pub trainers: usize,
     /// Database URL: sqlite:PATH or postgres://USER@HOST/NAME (default: SQLite below --data)
     #[arg(long, env = "HYDROFLEX_DATABASE", hide_env_values = true)]

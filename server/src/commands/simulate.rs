@@ -34,7 +34,7 @@ pub struct Args {
     #[arg(long)]
     pub out: PathBuf,
     /// Threads (default: one per core)
-    #[arg(long)]
+    #[arg(long, value_parser = super::at_once(1))]
     pub threads: Option<usize>,
     /// Time integration
     #[arg(long, value_enum, default_value_t = IntegratorName::Accurate)]

@@ -23,7 +23,7 @@ pub struct Args {
     #[arg(long)]
     pub cache: Option<PathBuf>,
     /// Threads that simulate or train
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = super::at_once(1))]
     pub threads: usize,
     /// Finish the shard in hand and stop after this many seconds
     #[arg(long)]

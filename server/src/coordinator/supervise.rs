@@ -127,6 +127,10 @@ fn supervise(config: &SuperviseConfig, stop: &AtomicBool, restarts: &AtomicU64) 
     let initial = slots.len() as u64;
     while !stop.load(Ordering::Relaxed) {
         for slot in &mut slots {
+            // To start many takes a while, and may be what somebody wants to end.
+            if stop.load(Ordering::Relaxed) {
+                break;
+            }
             tend(slot, config, &mut started);
         }
         restarts.store(started.saturating_sub(initial), Ordering::Relaxed);

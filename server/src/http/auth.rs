@@ -98,7 +98,8 @@ async fn check(state: &AppState, scope: Option<Scope>, headers: &HeaderMap) -> R
         return Ok(());
     };
     let key = bearer(headers).ok_or_else(|| {
-        ApiError::Unauthorized("this service asks for a key: Authorization: Bearer KEY".to_owned())
+        ApiError::Unauthorized("this service asks for a key: Authorization: Bearer KEY (`hydroflex key create`, where the service runs, makes one)"
+                .to_owned())
     })?;
     // Unknown and ended keys get the same answer at the same cost: a lookup by hash.
     let record = door

@@ -90,8 +90,13 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
         .rsplit_once(" at line ")
         .map_or(text.as_str(), |(head, _)| head);
     let (detail, allowed) = match text.split_once(", expected ") {
-        Some((head, expected)) => (head, Some(expected)),
+        Some((head, expected)) => (head, Some(in_words_of_json(expected))),
         None => (text, None),
+    };
+    let detail = match detail {
+        "invalid type: map" => "invalid type: an object",
+        "invalid type: sequence" => "invalid type: a list",
+        other => other,
     };
     // An unknown field is the fault of that field, not of the object that holds it.
     if let Some(name) = detail
@@ -114,6 +119,20 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
         field = field.allowed(allowed);
     }
     Err(ApiError::field(field))
+}
+
+/// What serde expects, as somebody who writes JSON calls it.
+fn in_words_of_json(expected: &str) -> &str {
+    match expected {
+        "f64" | "f32" => "a number",
+        "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number, 0 or more",
+        "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
+        "a sequence" => "a list",
+        "a map" => "an object",
+        "string or map" => "a string or an object",
+        other if other.starts_with("struct ") || other.starts_with("internally tagged enum ") => "an object",
+        other => other,
+    }
 }
 
 /// An identifier in the path. One that cannot exist is not found, like one that does not.
@@ -324,7 +343,7 @@ mod tests {
         let wrong_type = refusal(r#"{"runs": 80, "split": {"train": "most", "validation": 0.2}}"#);
         assert_eq!(wrong_type.pointer, "/split/train");
         assert_eq!(wrong_type.value, Some("most".into()));
-        assert_eq!(wrong_type.allowed.as_deref(), Some("f64"));
+        assert_eq!(wrong_type.allowed.as_deref(), Some("a number"));
 
         let unknown = refusal(r#"{"runs": 80, "split": {"training": 0.8, "validation": 0.2}}"#);
         assert_eq!(unknown.pointer, "/split/training");
@@ -335,6 +354,12 @@ mod tests {
         assert_eq!(
             (missing.pointer.as_str(), missing.detail.as_str()),
             ("", "missing field `runs`")
+        );
+
+        let object = refusal(r#"{"runs": 80, "train": {}}"#);
+        assert_eq!(
+            (object.detail.as_str(), object.allowed.as_deref()),
+            ("invalid type: an object", Some("a list"))
         );
 
         let negative = refusal(r#"{"runs": -3}"#);
