@@ -8,6 +8,7 @@
 use nalgebra::{DMatrix, Matrix3, SymmetricEigen, Vector3, Vector4};
 
 use super::rotation::{rate_map, rotation_matrix, skew};
+use crate::instruction_set::widest;
 use crate::reduction::ReducedBody;
 
 /// Why a reduced body cannot move.
@@ -236,76 +237,12 @@ impl FloatingFrame {
 
     /// Evaluates the motion from coordinates `[r, θ, η]` and their first and second derivatives.
     pub fn evaluate(&self, q: &[f64], v: &[f64], a: &[f64], out: &mut BodyMotion) {
-        let theta = Vector4::from_column_slice(&q[3..7]);
-        let map = rate_map(&theta);
-        out.origin_m = Vector3::from_column_slice(&q[..3]);
-        out.rotation = rotation_matrix(&theta);
-        out.velocity_m_per_s = Vector3::from_column_slice(&v[..3]);
-        out.acceleration_m_per_s2 = Vector3::from_column_slice(&a[..3]);
-        out.omega_rad_per_s = map * Vector4::from_column_slice(&v[3..7]);
-        out.alpha_rad_per_s2 = map * Vector4::from_column_slice(&a[3..7]);
-        out.eta.copy_from_slice(&q[7..]);
-        out.eta_rate.copy_from_slice(&v[7..]);
-        out.eta_acceleration.copy_from_slice(&a[7..]);
-
-        let n = self.mode_count();
-        out.moment_kg_m = self.first_moment_kg_m;
-        out.f_blocks.copy_from_slice(&self.n_blocks);
-        out.coriolis.fill(0.0);
-        for (k, c) in self.c_xp.iter().enumerate() {
-            out.r_columns[3 * k..3 * k + 3].copy_from_slice(c.as_slice());
-        }
-        for m in 0..n {
-            let (eta, rate) = (out.eta[m], out.eta_rate[m]);
-            out.moment_kg_m += self.c_pt[m] * eta;
-            add_scaled(&mut out.f_blocks, eta, &self.b_rows[9 * n * m..9 * n * (m + 1)]);
-            let c_row = &self.c_rows[3 * n * m..3 * n * (m + 1)];
-            add_scaled(&mut out.r_columns, eta, c_row);
-            add_scaled(&mut out.coriolis, rate, c_row);
-        }
-        // Θ = Θ₀ + Xᵀ + Σ η_k F_k, because Σ η_k F_k = X + Σ η_m η_k B_mk.
-        let mut sum = [0.0; 9];
-        let mut x = [0.0; 9];
-        for k in 0..n {
-            add_scaled(&mut sum, out.eta[k], &out.f_blocks[9 * k..9 * k + 9]);
-            add_scaled(&mut x, out.eta[k], &self.n_blocks[9 * k..9 * k + 9]);
-        }
-        out.inertia_kg_m2 = self.inertia_kg_m2
-            + Matrix3::from_column_slice(&sum)
-            + Matrix3::from_column_slice(&x).transpose();
+        evaluate(self, q, v, a, out);
     }
 
     /// Adds `M q̈ − f_v − f_e` to the residual rows: force (global), moment (body frame), modal.
-    #[allow(clippy::needless_range_loop, reason = "many lists share the mode's number")]
     pub fn add_inertia_and_elastic(&self, motion: &BodyMotion, frame: &mut [f64], modal: &mut [f64]) {
-        let w = &motion.omega_rad_per_s;
-        let wd = &motion.alpha_rad_per_s2;
-        let s = &motion.moment_kg_m;
-        let a_local = motion.rotation.tr_mul(&motion.acceleration_m_per_s2);
-        let (mut s_rate, mut s_acceleration) = (Vector3::zeros(), Vector3::zeros());
-        let (mut theta_rate, mut r_eta) = ([0.0; 9], Vector3::zeros());
-        for k in 0..self.mode_count() {
-            let (rate, acceleration) = (motion.eta_rate[k], motion.eta_acceleration[k]);
-            s_rate += self.c_pt[k] * rate;
-            s_acceleration += self.c_pt[k] * acceleration;
-            let block = &motion.f_blocks[9 * k..9 * k + 9];
-            add_scaled(&mut theta_rate, rate, block);
-            let r_k = Vector3::from_column_slice(&motion.r_columns[3 * k..3 * k + 3]);
-            r_eta += r_k * acceleration;
-            let c_k = Vector3::from_column_slice(&motion.coriolis[3 * k..3 * k + 3]);
-            modal[k] += self.c_pt[k].dot(&a_local) - r_k.dot(wd) + acceleration
-                - quadratic_form(block, w)
-                - 2.0 * c_k.dot(w)
-                + self.stiffness[k] * motion.eta[k]
-                + self.damping[k] * rate;
-        }
-        let local = wd.cross(s) + w.cross(&w.cross(s)) + 2.0 * w.cross(&s_rate) + s_acceleration;
-        let force = self.mass_kg * motion.acceleration_m_per_s2 + motion.rotation * local;
-        let moment = s.cross(&a_local) + motion.inertia_kg_m2 * wd - r_eta
-            + w.cross(&(motion.inertia_kg_m2 * w))
-            + 2.0 * (Matrix3::from_column_slice(&theta_rate) * w);
-        add_vector(&mut frame[..3], &force);
-        add_vector(&mut frame[3..6], &moment);
+        add_inertia_and_elastic(self, motion, frame, modal);
     }
 
     /// Subtracts gravity from the residual rows (theory note §3.5). With `deformed` the moment
@@ -394,6 +331,115 @@ impl FloatingFrame {
     pub fn gravity_potential_j(&self, motion: &BodyMotion, gravity_m_per_s2: &Vector3<f64>) -> f64 {
         -gravity_m_per_s2.dot(&(self.mass_kg * motion.origin_m + motion.rotation * motion.moment_kg_m))
     }
+}
+
+widest! {
+    fn evaluate(body: &FloatingFrame, q: &[f64], v: &[f64], a: &[f64], out: &mut BodyMotion) {
+        let theta = Vector4::from_column_slice(&q[3..7]);
+        let map = rate_map(&theta);
+        out.origin_m = Vector3::from_column_slice(&q[..3]);
+        out.rotation = rotation_matrix(&theta);
+        out.velocity_m_per_s = Vector3::from_column_slice(&v[..3]);
+        out.acceleration_m_per_s2 = Vector3::from_column_slice(&a[..3]);
+        out.omega_rad_per_s = map * Vector4::from_column_slice(&v[3..7]);
+        out.alpha_rad_per_s2 = map * Vector4::from_column_slice(&a[3..7]);
+        out.eta.copy_from_slice(&q[7..]);
+        out.eta_rate.copy_from_slice(&v[7..]);
+        out.eta_acceleration.copy_from_slice(&a[7..]);
+
+        let n = body.mode_count();
+        out.moment_kg_m = body.first_moment_kg_m;
+        out.f_blocks.copy_from_slice(&body.n_blocks);
+        out.coriolis.fill(0.0);
+        for (k, c) in body.c_xp.iter().enumerate() {
+            out.r_columns[3 * k..3 * k + 3].copy_from_slice(c.as_slice());
+        }
+        for m in 0..n {
+            out.moment_kg_m += body.c_pt[m] * out.eta[m];
+        }
+        add_combination(&mut out.f_blocks, &out.eta, &body.b_rows);
+        add_combination(&mut out.r_columns, &out.eta, &body.c_rows);
+        add_combination(&mut out.coriolis, &out.eta_rate, &body.c_rows);
+        // Θ = Θ₀ + Xᵀ + Σ η_k F_k, because Σ η_k F_k = X + Σ η_m η_k B_mk.
+        let mut sum = [0.0; 9];
+        let mut x = [0.0; 9];
+        for k in 0..n {
+            add_scaled(&mut sum, out.eta[k], &out.f_blocks[9 * k..9 * k + 9]);
+            add_scaled(&mut x, out.eta[k], &body.n_blocks[9 * k..9 * k + 9]);
+        }
+        out.inertia_kg_m2 = body.inertia_kg_m2
+            + Matrix3::from_column_slice(&sum)
+            + Matrix3::from_column_slice(&x).transpose();
+    }
+}
+
+widest! {
+    #[allow(clippy::needless_range_loop, reason = "many lists share the mode's number")]
+    fn add_inertia_and_elastic(body: &FloatingFrame, motion: &BodyMotion, frame: &mut [f64], modal: &mut [f64]) {
+        let w = &motion.omega_rad_per_s;
+        let wd = &motion.alpha_rad_per_s2;
+        let s = &motion.moment_kg_m;
+        let a_local = motion.rotation.tr_mul(&motion.acceleration_m_per_s2);
+        let (mut s_rate, mut s_acceleration) = (Vector3::zeros(), Vector3::zeros());
+        let (mut theta_rate, mut r_eta) = ([0.0; 9], Vector3::zeros());
+        for k in 0..body.mode_count() {
+            let (rate, acceleration) = (motion.eta_rate[k], motion.eta_acceleration[k]);
+            s_rate += body.c_pt[k] * rate;
+            s_acceleration += body.c_pt[k] * acceleration;
+            let block = &motion.f_blocks[9 * k..9 * k + 9];
+            add_scaled(&mut theta_rate, rate, block);
+            let r_k = Vector3::from_column_slice(&motion.r_columns[3 * k..3 * k + 3]);
+            r_eta += r_k * acceleration;
+            let c_k = Vector3::from_column_slice(&motion.coriolis[3 * k..3 * k + 3]);
+            modal[k] += body.c_pt[k].dot(&a_local) - r_k.dot(wd) + acceleration
+                - quadratic_form(block, w)
+                - 2.0 * c_k.dot(w)
+                + body.stiffness[k] * motion.eta[k]
+                + body.damping[k] * rate;
+        }
+        let local = wd.cross(s) + w.cross(&w.cross(s)) + 2.0 * w.cross(&s_rate) + s_acceleration;
+        let force = body.mass_kg * motion.acceleration_m_per_s2 + motion.rotation * local;
+        let moment = s.cross(&a_local) + motion.inertia_kg_m2 * wd - r_eta
+            + w.cross(&(motion.inertia_kg_m2 * w))
+            + 2.0 * (Matrix3::from_column_slice(&theta_rate) * w);
+        add_vector(&mut frame[..3], &force);
+        add_vector(&mut frame[3..6], &moment);
+    }
+}
+
+/// `out += Σ_m factors[m] · rows[m]`, in this order; a row is as long as `out`.
+#[allow(
+    clippy::inline_always,
+    reason = "part of a function that enables wide instructions"
+)]
+#[inline(always)]
+fn add_combination(out: &mut [f64], factors: &[f64], rows: &[f64]) {
+    // Sums stay in registers: enough of them at once that none waits for the one before.
+    let first = add_pieces::<48>(out, 0, factors, rows);
+    let first = add_pieces::<8>(out, first, factors, rows);
+    add_pieces::<1>(out, first, factors, rows);
+}
+
+/// The same for whole pieces of `WIDTH` values from `first` on; returns where they end.
+#[allow(
+    clippy::inline_always,
+    reason = "part of a function that enables wide instructions"
+)]
+#[inline(always)]
+fn add_pieces<const WIDTH: usize>(out: &mut [f64], mut first: usize, factors: &[f64], rows: &[f64]) -> usize {
+    let length = out.len();
+    while first + WIDTH <= length {
+        let mut sums = [0.0; WIDTH];
+        sums.copy_from_slice(&out[first..first + WIDTH]);
+        for (factor, row) in factors.iter().zip(rows.chunks_exact(length)) {
+            for (sum, x) in sums.iter_mut().zip(&row[first..first + WIDTH]) {
+                *sum += factor * x;
+            }
+        }
+        out[first..first + WIDTH].copy_from_slice(&sums);
+        first += WIDTH;
+    }
+    first
 }
 
 /// `V` with `Vᵀ M V = 1` and `Vᵀ K V = diag(ω²)`, ascending, and `ω²`.

@@ -6,48 +6,8 @@ use super::constants::Constants;
 use super::lockstep::{Common, OwnBodies, RunResult, simulate};
 use super::model::PlanarModel;
 use super::step::StepBuffer;
+use crate::instruction_set::InstructionSet;
 use crate::trajectory::RunInput;
-
-/// Instruction set of the step loop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum InstructionSet {
-    /// What every machine of the architecture has.
-    Portable,
-    /// AVX2: four runs in lock-step.
-    Avx2,
-    /// AVX-512: eight runs in lock-step.
-    Avx512,
-}
-
-impl InstructionSet {
-    /// The widest that this machine has.
-    #[must_use]
-    pub fn detect() -> Self {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("avx512dq")
-            {
-                return Self::Avx512;
-            }
-            if is_x86_feature_detected!("avx2") {
-                return Self::Avx2;
-            }
-        }
-        Self::Portable
-    }
-
-    /// All that this machine has.
-    #[must_use]
-    pub fn available() -> Vec<Self> {
-        match Self::detect() {
-            Self::Portable => vec![Self::Portable],
-            Self::Avx2 => vec![Self::Portable, Self::Avx2],
-            Self::Avx512 => vec![Self::Portable, Self::Avx2, Self::Avx512],
-        }
-    }
-}
 
 /// One run after the other.
 pub(super) fn one_by_one<const A: usize, const B: usize, const Q: usize>(

@@ -33,7 +33,7 @@ mod track;
 #[cfg(test)]
 mod tests;
 
-pub use dispatch::InstructionSet;
+pub use crate::instruction_set::InstructionSet;
 pub use model::{MOST_MODES, NotPlanar, PlanarModel};
 
 use crate::equilibrium::EquilibriumError;

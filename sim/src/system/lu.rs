@@ -1,5 +1,7 @@
 //! Dense LU factorisation with partial pivoting, in place and without allocation.
 
+use crate::instruction_set::widest;
+
 /// Factors of a square matrix stored row by row.
 #[derive(Debug, Clone, Default)]
 pub struct DenseLu {
@@ -29,56 +31,12 @@ impl DenseLu {
     /// Factors `values`. Returns false where a pivot is zero or not finite.
     #[must_use]
     pub fn factorise(&mut self) -> bool {
-        let n = self.order;
-        for k in 0..n {
-            let mut pivot = k;
-            let mut largest = self.values[k * n + k].abs();
-            for i in k + 1..n {
-                let candidate = self.values[i * n + k].abs();
-                if candidate > largest {
-                    (pivot, largest) = (i, candidate);
-                }
-            }
-            if !(largest > 0.0 && largest.is_finite()) {
-                return false;
-            }
-            self.pivots[k] = pivot;
-            if pivot != k {
-                let (head, tail) = self.values.split_at_mut(pivot * n);
-                head[k * n..(k + 1) * n].swap_with_slice(&mut tail[..n]);
-            }
-            let (head, tail) = self.values.split_at_mut((k + 1) * n);
-            let top = &head[k * n + k..];
-            let inverse = 1.0 / top[0];
-            for row in tail.chunks_exact_mut(n) {
-                let row = &mut row[k..];
-                if row[0] == 0.0 {
-                    continue;
-                }
-                let factor = row[0] * inverse;
-                row[0] = factor;
-                for (r, t) in row[1..].iter_mut().zip(&top[1..]) {
-                    *r -= factor * t;
-                }
-            }
-        }
-        true
+        factorise(self)
     }
 
     /// Solves in place with the factors.
     pub fn solve(&self, right: &mut [f64]) {
-        let n = self.order;
-        debug_assert_eq!(right.len(), n);
-        for k in 0..n {
-            right.swap(k, self.pivots[k]);
-        }
-        for i in 0..n {
-            right[i] -= dot(&self.values[i * n..i * n + i], &right[..i]);
-        }
-        for i in (0..n).rev() {
-            let row = &self.values[i * n..(i + 1) * n];
-            right[i] = (right[i] - dot(&row[i + 1..], &right[i + 1..])) / row[i];
-        }
+        solve(self, right);
     }
 
     /// Solves with the transposed matrix, in place.
@@ -107,20 +65,72 @@ impl DenseLu {
     }
 }
 
+widest! {
+    fn factorise(lu: &mut DenseLu) -> bool {
+        let n = lu.order;
+        for k in 0..n {
+            let mut pivot = k;
+            let mut largest = lu.values[k * n + k].abs();
+            for i in k + 1..n {
+                let candidate = lu.values[i * n + k].abs();
+                if candidate > largest {
+                    (pivot, largest) = (i, candidate);
+                }
+            }
+            if !(largest > 0.0 && largest.is_finite()) {
+                return false;
+            }
+            lu.pivots[k] = pivot;
+            if pivot != k {
+                let (head, tail) = lu.values.split_at_mut(pivot * n);
+                head[k * n..(k + 1) * n].swap_with_slice(&mut tail[..n]);
+            }
+            let (head, tail) = lu.values.split_at_mut((k + 1) * n);
+            let top = &head[k * n + k..];
+            let inverse = 1.0 / top[0];
+            for row in tail.chunks_exact_mut(n) {
+                let row = &mut row[k..];
+                if row[0] == 0.0 {
+                    continue;
+                }
+                let factor = row[0] * inverse;
+                row[0] = factor;
+                for (r, t) in row[1..].iter_mut().zip(&top[1..]) {
+                    *r -= factor * t;
+                }
+            }
+        }
+        true
+    }
+}
+
+widest! {
+    fn solve(lu: &DenseLu, right: &mut [f64]) {
+        let n = lu.order;
+        debug_assert_eq!(right.len(), n);
+        for k in 0..n {
+            right.swap(k, lu.pivots[k]);
+        }
+        for i in 0..n {
+            right[i] -= dot(&lu.values[i * n..i * n + i], &right[..i]);
+        }
+        for i in (0..n).rev() {
+            let row = &lu.values[i * n..(i + 1) * n];
+            right[i] = (right[i] - dot(&row[i + 1..], &right[i + 1..])) / row[i];
+        }
+    }
+}
+
 /// Sum of products in four strands: one strand would wait for every addition.
+#[allow(clippy::inline_always, reason = "part of a function that enables wide instructions")]
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut strands = [0.0; 4];
-    let (a4, b4) = (a.chunks_exact(4), b.chunks_exact(4));
-    let rest: f64 = a4
-        .remainder()
-        .iter()
-        .zip(b4.remainder())
-        .map(|(x, y)| x * y)
-        .sum();
-    for (x, y) in a4.zip(b4) {
-        for k in 0..4 {
-            strands[k] += x[k] * y[k];
-        }
+    let ((a4, a_rest), (b4, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum();
+    for (x, y) in a4.iter().zip(b4) {
+        let products: [f64; 4] = std::array::from_fn(|k| x[k] * y[k]);
+        strands = std::array::from_fn(|k| strands[k] + products[k]);
     }
     (strands[0] + strands[1]) + (strands[2] + strands[3]) + rest
 }
