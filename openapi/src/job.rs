@@ -136,7 +136,10 @@ impl JobSpec {
 
 /// Which machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected the name of a built-in machine, or `{\"toml\": \"…\"}` with the text of a machine file"
+)]
 pub enum MachineRef {
     /// A machine that the binary carries.
     BuiltIn(String),
@@ -149,7 +152,10 @@ pub enum MachineRef {
 
 /// Which material.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected `steel`, `aluminium`, `titanium`, or an object with name, youngs_modulus_pa, poisson_ratio and density_kg_per_m3"
+)]
 pub enum MaterialRef {
     /// `steel`, `aluminium` or `titanium`.
     Named(String),
@@ -179,7 +185,10 @@ impl MaterialRef {
 
 /// A number, or a range `{"min": a, "max": b}`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected a number, or `{\"min\": …, \"max\": …}` for a random one of each run"
+)]
 pub enum ValueOrRange {
     /// The same for every run.
     Value(f64),
@@ -244,7 +253,7 @@ impl Default for Split {
 
 /// Time integration.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
-#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+#[serde(tag = "kind", rename_all = "kebab-case", try_from = "IntegratorFields")]
 pub enum Integrator {
     /// Error-controlled; every channel but accelerations within 1e-3 of converged.
     #[default]
@@ -263,6 +272,43 @@ pub enum Integrator {
         #[serde(default = "default_sample_time_s")]
         step_s: f64,
     },
+}
+
+/// [`Integrator`] as it is written: serde would let `accurate` have any other fields.
+#[derive(Deserialize)]
+#[serde(
+    deny_unknown_fields,
+    expecting = "`{\"kind\": \"accurate\"}`, or `trapezoidal-index-2` or `generalized-alpha` with `step_s`"
+)]
+struct IntegratorFields {
+    kind: IntegratorKind,
+    step_s: Option<f64>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum IntegratorKind {
+    Accurate,
+    #[serde(rename = "trapezoidal-index-2")]
+    TrapezoidalIndex2,
+    GeneralizedAlpha,
+}
+
+impl TryFrom<IntegratorFields> for Integrator {
+    type Error = String;
+
+    fn try_from(fields: IntegratorFields) -> Result<Self, String> {
+        let step_s = fields.step_s.unwrap_or_else(default_sample_time_s);
+        match (fields.kind, fields.step_s) {
+            (IntegratorKind::Accurate, None) => Ok(Self::Accurate),
+            (IntegratorKind::Accurate, Some(step_s)) => Err(format!(
+                "step_s is {step_s}, but `accurate` chooses its steps itself, expected a fixed-step scheme \
+                 (`trapezoidal-index-2`, `generalized-alpha`) where a step is given"
+            )),
+            (IntegratorKind::TrapezoidalIndex2, _) => Ok(Self::TrapezoidalIndex2 { step_s }),
+            (IntegratorKind::GeneralizedAlpha, _) => Ok(Self::GeneralizedAlpha { step_s }),
+        }
+    }
 }
 
 /// What a run met on its way. A flagged run is valid data.
@@ -456,7 +502,10 @@ pub struct TrainingSpec {
 /// Sensor noise: a level by name, or standard deviations of the inputs by column, in their units; columns that are
 /// not named are free of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected `crane`, or an object with a standard deviation per column"
+)]
 pub enum NoiseSpec {
     /// Measured on a machine.
     Level(NoiseLevel),

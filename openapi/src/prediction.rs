@@ -19,7 +19,10 @@ pub struct PredictRequest {
 
 /// A signal: values over time, or one value for a signal that does not change.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected a number, or a list of numbers, one per sample"
+)]
 pub enum Signal {
     /// The same value for all samples. If every input is constant, one window of them is meant.
     Constant(f64),

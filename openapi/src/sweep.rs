@@ -55,7 +55,10 @@ impl SweepGrid {
 
 /// Sensors that a network sees.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "invalid value, expected a sensor set (`all`, `usp`, `usdp2`, `usd`, `us`) or a list of channels"
+)]
 pub enum Sensors {
     /// As in the paper, of every cylinder.
     Set(SensorSet),

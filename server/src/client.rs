@@ -13,6 +13,7 @@ use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt::Write as _;
+use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};
 
 /// Environment variable with the API key; an argument could be read by every user of the machine.
@@ -20,6 +21,9 @@ const KEY: &str = "HYDROFLEX_KEY";
 
 /// How often a job is looked at.
 const POLL: Duration = Duration::from_millis(100);
+
+/// How often a line says how a job goes on where bars cannot be drawn.
+const LINE: Duration = Duration::from_secs(10);
 
 /// How long a service may be away (a restart) before following a job gives up.
 const PATIENCE: Duration = Duration::from_mins(1);
@@ -146,12 +150,17 @@ impl Client {
     /// If the service stays away.
     pub fn follow(&self, job: &str, quiet: bool) -> anyhow::Result<JobStatus> {
         let mut stages = Stages::new(quiet);
+        // Bars are for terminals; a log gets lines.
+        let mut lines = (!quiet && !std::io::stderr().is_terminal()).then(Lines::default);
         let mut away_since: Option<Instant> = None;
         loop {
             match self.get::<JobStatus>(&format!("/v1/jobs/{job}")) {
                 Ok(status) => {
                     away_since = None;
                     stages.show(&status);
+                    if let Some(lines) = &mut lines {
+                        lines.show(&status);
+                    }
                     if status.state.is_final() {
                         stages.finish(&status);
                         return Ok(status);
@@ -189,6 +198,42 @@ fn describe(status: StatusCode, body: &str) -> String {
         }
     }
     text
+}
+
+/// A line on standard error whenever a job is in another state, and now and then between.
+#[derive(Default)]
+struct Lines {
+    last: Option<(JobState, Instant)>,
+}
+
+impl Lines {
+    fn show(&mut self, status: &JobStatus) {
+        if let Some((state, since)) = self.last
+            && state == status.state
+            && since.elapsed() < LINE
+        {
+            return;
+        }
+        self.last = Some((status.state, Instant::now()));
+        let progress = &status.progress;
+        let mut line = format!(
+            "{}: {} of {} runs",
+            status.state, progress.runs_done, progress.runs_total
+        );
+        let training = status
+            .trainings
+            .iter()
+            .filter_map(|training| training.progress.as_ref());
+        for (number, progress) in training.enumerate() {
+            let _ = write!(
+                line,
+                ", training {} {:.0} %",
+                number + 1,
+                100.0 * progress.fraction
+            );
+        }
+        eprintln!("{line}");
+    }
 }
 
 /// One bar for each stage of a job.

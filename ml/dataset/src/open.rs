@@ -193,14 +193,16 @@ impl Dataset {
     /// # Errors
     /// A file is damaged or cannot be read.
     pub fn verify(&self) -> Result<(), OpenError> {
-        for file in &self.manifest.files {
-            self.verify_file(&file.path, &file.sha256)?;
-        }
         let path = self.root.join("SHA256SUMS");
         let sums = String::from_utf8_lossy(&read(&path)?).into_owned();
-        for line in sums.lines() {
-            if let Some((sha256, file)) = line.split_once("  ") {
-                self.verify_file(file, sha256)?;
+        let mut verified = std::collections::HashSet::new();
+        for (sha256, file) in sums.lines().filter_map(|line| line.split_once("  ")) {
+            self.verify_file(file, sha256)?;
+            verified.insert((file, sha256));
+        }
+        for file in &self.manifest.files {
+            if !verified.contains(&(file.path.as_str(), file.sha256.as_str())) {
+                self.verify_file(&file.path, &file.sha256)?;
             }
         }
         Ok(())

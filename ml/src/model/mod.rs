@@ -41,6 +41,14 @@ pub enum ModelError {
         #[source]
         source: std::io::Error,
     },
+    /// A model would be written over what is not one.
+    #[error("{} {what}; a model is written to a folder that is absent or empty, or replaces another model", path.display())]
+    Occupied {
+        /// Folder.
+        path: PathBuf,
+        /// What is there.
+        what: String,
+    },
     /// `config.json` is not what this version reads.
     #[error("cannot read {}", path.display())]
     Config {

@@ -19,9 +19,13 @@ use hydroflex_openapi::model::{
 };
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 
+/// Hashes of a model's files.
+const SUMS: &str = "SHA256SUMS";
+/// What every model has.
+const CONFIG: &str = "config.json";
 /// Windows stored with their estimates.
 const GOLDEN_WINDOWS: usize = 3;
 /// Version of the tensor framework, as in the workspace's manifest.
@@ -34,10 +38,10 @@ const GUARD_ROOM: f64 = 1.5;
 /// … and around the range of the targets, relative to it.
 const GUARD_MARGIN: f64 = 0.5;
 
-/// Assembles the model and writes its folder, replacing what is there.
+/// Assembles the model and writes its folder; a model that is there is replaced.
 ///
 /// # Errors
-/// A file cannot be written, or the written model cannot be read back.
+/// Something else than a model is there, a file cannot be written, or the written model cannot be read back.
 pub fn write_model(
     problem: &Problem,
     data: &TrainingData,
@@ -96,7 +100,7 @@ pub(crate) fn write_parts(
     let mut files = vec![
         ("README.md", card::card(config, pictures).into_bytes()),
         ("auxiliary.safetensors", auxiliary.to_file().map_err(tensors)?),
-        ("config.json", to_json(config)),
+        (CONFIG, to_json(config)),
         ("model.onnx", super::onnx::to_onnx(config, weights)),
         (
             "model.safetensors",
@@ -111,6 +115,70 @@ pub(crate) fn write_parts(
     write_folder(out_dir, &files)
 }
 
+/// What stands where a model is to be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// Nothing, or an empty folder.
+    Free,
+    /// A model, and nothing beside its files.
+    Model,
+}
+
+/// Looks whether a model can be written to a folder without touching what is not a model's.
+///
+/// # Errors
+/// Something else is there, or it cannot be looked at.
+pub fn place(out_dir: &Path) -> Result<Place, ModelError> {
+    let occupied = |what: String| ModelError::Occupied {
+        path: out_dir.to_owned(),
+        what,
+    };
+    let cannot_read = |source| ModelError::File {
+        action: "read",
+        path: out_dir.to_owned(),
+        source,
+    };
+    if out_dir.file_name().is_none() {
+        return Err(occupied("names no folder of its own".to_owned()));
+    }
+    match fs::symlink_metadata(out_dir) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Place::Free),
+        Err(error) => return Err(cannot_read(error)),
+        Ok(meta) if !meta.is_dir() => return Err(occupied("is not a folder".to_owned())),
+        Ok(_) => {}
+    }
+    let mut names = Vec::new();
+    for entry in fs::read_dir(out_dir).map_err(cannot_read)? {
+        names.push(
+            entry
+                .map_err(cannot_read)?
+                .file_name()
+                .to_string_lossy()
+                .into_owned(),
+        );
+    }
+    if names.is_empty() {
+        return Ok(Place::Free);
+    }
+    names.sort();
+    let sums = fs::read_to_string(out_dir.join(SUMS)).unwrap_or_default();
+    let mut own: Vec<&str> = sums
+        .lines()
+        .filter_map(|line| line.split_once("  ").map(|(_, name)| name))
+        .collect();
+    if !own.contains(&CONFIG) {
+        own.clear();
+    }
+    let foreign = names
+        .iter()
+        .find(|name| *name != SUMS && !own.contains(&name.as_str()));
+    match foreign {
+        Some(name) => Err(occupied(format!("holds {name:?}, which is no model's file"))),
+        None if own.is_empty() => Err(occupied(format!("holds {SUMS} alone"))),
+        None => Ok(Place::Model),
+    }
+}
+
 /// Writes `files` into a fresh folder beside `out_dir`, then puts it in place.
 fn write_folder(out_dir: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), ModelError> {
     let file_error = |path: &Path| {
@@ -121,6 +189,7 @@ fn write_folder(out_dir: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), ModelEr
             source,
         }
     };
+    let before = place(out_dir)?;
     let name = out_dir
         .file_name()
         .map(|n| n.to_string_lossy().into_owned())
@@ -135,12 +204,19 @@ fn write_folder(out_dir: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), ModelEr
         write_durably(&temporary.join(name), content).map_err(file_error(&temporary.join(name)))?;
         sums.extend([hex::encode(Sha256::digest(content)).as_str(), "  ", name, "\n"]);
     }
-    let path = temporary.join("SHA256SUMS");
+    let path = temporary.join(SUMS);
     write_durably(&path, sums.as_bytes()).map_err(file_error(&path))?;
-    if out_dir.exists() {
-        fs::remove_dir_all(out_dir).map_err(file_error(out_dir))?;
+    // An empty folder gives way to a rename; a model is moved aside first, so that one of both is always whole.
+    if before == Place::Free {
+        return fs::rename(&temporary, out_dir).map_err(file_error(out_dir));
     }
-    fs::rename(&temporary, out_dir).map_err(file_error(out_dir))
+    let aside = out_dir.with_file_name(format!(".{name}.old"));
+    if aside.exists() {
+        fs::remove_dir_all(&aside).map_err(file_error(&aside))?;
+    }
+    fs::rename(out_dir, &aside).map_err(file_error(out_dir))?;
+    fs::rename(&temporary, out_dir).map_err(file_error(out_dir))?;
+    fs::remove_dir_all(&aside).map_err(file_error(&aside))
 }
 
 fn write_durably(path: &Path, content: &[u8]) -> std::io::Result<()> {
@@ -539,5 +615,51 @@ fn summary(model: &Model, problem: &Problem, outcome: &Outcome) -> ModelSummary 
         train_seconds: outcome.elapsed_s,
         validation: config.validation.clone(),
         validation_least_squares: config.validation_least_squares.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_model_is_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("model");
+        assert_eq!(place(&out).unwrap(), Place::Free);
+        let files = [(CONFIG, b"{}".to_vec()), ("README.md", b"one".to_vec())];
+        write_folder(&out, &files).unwrap();
+        assert_eq!(place(&out).unwrap(), Place::Model);
+        let files = [(CONFIG, b"{}".to_vec()), ("README.md", b"two".to_vec())];
+        write_folder(&out, &files).unwrap();
+        assert_eq!(fs::read(out.join("README.md")).unwrap(), b"two");
+
+        fs::write(out.join("thesis.txt"), "mine").unwrap();
+        let refused = write_folder(&out, &files).unwrap_err().to_string();
+        assert!(refused.contains("thesis.txt"), "{refused}");
+        assert_eq!(fs::read(out.join("thesis.txt")).unwrap(), b"mine");
+
+        let mine = folder.path().join("mine");
+        fs::create_dir(&mine).unwrap();
+        assert_eq!(place(&mine).unwrap(), Place::Free);
+        fs::write(mine.join("config.json"), "{}").unwrap();
+        for dir in [
+            mine.clone(),
+            mine.join("config.json"),
+            mine.join(".."),
+            "..".into(),
+            "/".into(),
+        ] {
+            assert!(
+                matches!(write_folder(&dir, &files), Err(ModelError::Occupied { .. })),
+                "{}",
+                dir.display()
+            );
+        }
+        let left: Vec<_> = fs::read_dir(folder.path())
+            .unwrap()
+            .map(|e| e.unwrap().file_name())
+            .collect();
+        assert_eq!(left.len(), 2, "{left:?}");
     }
 }

@@ -205,6 +205,8 @@ pub fn train(
             name: spec.structure.clone(),
         }));
     }
+    // Before the work, not after it.
+    crate::model::write::place(out_dir)?;
     let problem = Problem::new(data, spec)?;
     let outcome = fit(&problem, &data.dataset_sha256, progress, checkpoint_dir)?;
     let summary = crate::model::write::write_model(&problem, data, &outcome, out_dir)?;

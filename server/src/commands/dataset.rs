@@ -5,8 +5,9 @@ use crate::client::{self, Client};
 use anyhow::{Context, bail};
 use hydroflex_openapi::catalogue::{DatasetInfo, FileEntry};
 use sha2::{Digest, Sha256};
+use std::collections::HashMap;
 use std::fs::File;
-use std::io::{Read, Write as _};
+use std::io::{ErrorKind, Read, Write as _};
 use std::path::{Component, Path, PathBuf};
 
 /// Subcommands of `hydroflex dataset`.
@@ -58,6 +59,12 @@ pub fn run(command: Command) -> anyhow::Result<()> {
 /// If the service cannot be reached or refuses, a file cannot be written, or a hash does not match.
 pub fn fetch(client: &Client, dataset: &str, out: &Path, quiet: bool) -> anyhow::Result<DatasetInfo> {
     let info: DatasetInfo = client.get(&format!("/v1/datasets/{dataset}"))?;
+    let files: HashMap<&Path, &str> = info
+        .files
+        .iter()
+        .map(|file| (Path::new(&file.path), file.sha256.as_str()))
+        .collect();
+    refuse_foreign(out, out, &files)?;
     let base = format!("/v1/datasets/{dataset}/files");
     fetch_files(client, &base, &info.files, out, quiet)?;
     // The service's list and the data set's own must agree: the id promises the latter.
@@ -69,6 +76,44 @@ pub fn fetch(client: &Client, dataset: &str, out: &Path, quiet: bool) -> anyhow:
         );
     }
     Ok(info)
+}
+
+/// Refuses a directory that holds anything but these files and parts of them. `SHA256SUMS` has to be the one that is
+/// wanted; if it is there, other files may be damaged, and are downloaded again.
+fn refuse_foreign(root: &Path, folder: &Path, files: &HashMap<&Path, &str>) -> anyhow::Result<()> {
+    let cannot_read = || format!("cannot read {}", folder.display());
+    let entries = match std::fs::read_dir(folder) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        entries => entries.with_context(cannot_read)?,
+    };
+    for entry in entries {
+        let path = entry.with_context(cannot_read)?.path();
+        if path.is_dir() {
+            refuse_foreign(root, &path, files)?;
+            continue;
+        }
+        let name = path.strip_prefix(root).unwrap_or(&path);
+        let whole = name.with_extension("");
+        let is_part = name.extension().is_some_and(|e| e == "part") && files.contains_key(whole.as_path());
+        let why = match files.get(name) {
+            _ if is_part => continue,
+            None => "which is not a file of this data set",
+            Some(&sha256) if name == Path::new("SHA256SUMS") && sha256_of(&path)? != sha256 => {
+                "of another data set"
+            }
+            Some(&sha256) if !root.join("SHA256SUMS").exists() && sha256_of(&path)? != sha256 => {
+                "which differs from this data set's"
+            }
+            Some(_) => continue,
+        };
+        bail!(
+            "--out {} holds {}, {why}; it takes a directory that is absent or empty, or in which a download of the \
+             same data set stopped",
+            root.display(),
+            name.display()
+        );
+    }
+    Ok(())
 }
 
 /// Downloads listed files below a path of the service.
@@ -167,6 +212,32 @@ fn sha256_of(path: &Path) -> anyhow::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_download_goes_on_where_it_stopped_and_never_over_other_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("set");
+        let sha256 = |text: &str| hex::encode(Sha256::digest(text));
+        let (sums, data) = (sha256("sums"), sha256("data"));
+        let files = HashMap::from([
+            (Path::new("SHA256SUMS"), sums.as_str()),
+            (Path::new("data/a.parquet"), data.as_str()),
+        ]);
+        let check = || refuse_foreign(&out, &out, &files).map_err(|error| error.to_string());
+        assert_eq!(check(), Ok(()), "absent");
+        std::fs::create_dir_all(out.join("data")).unwrap();
+        std::fs::write(out.join("data/a.parquet.part"), "da").unwrap();
+        assert_eq!(check(), Ok(()), "a part");
+        std::fs::write(out.join("data/a.parquet"), "mine").unwrap();
+        assert!(check().unwrap_err().contains("data/a.parquet, which differs"));
+        std::fs::write(out.join("SHA256SUMS"), "sums").unwrap();
+        assert_eq!(check(), Ok(()), "a damaged file of the same set is repaired");
+        std::fs::write(out.join("SHA256SUMS"), "others").unwrap();
+        assert!(check().unwrap_err().contains("SHA256SUMS, of another data set"));
+        std::fs::write(out.join("SHA256SUMS"), "sums").unwrap();
+        std::fs::write(out.join("notes.md"), "mine").unwrap();
+        assert!(check().unwrap_err().contains("notes.md"));
+    }
 
     #[test]
     fn a_service_cannot_make_us_write_outside_of_the_directory() {

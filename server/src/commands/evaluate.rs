@@ -43,8 +43,7 @@ pub struct Args {
 /// Every failure ends the command with its reason.
 pub fn run(args: Args) -> anyhow::Result<()> {
     let model = Model::load(&args.model).with_context(|| format!("cannot load {}", args.model.display()))?;
-    let dataset =
-        Dataset::open(&args.data).with_context(|| format!("cannot open {}", args.data.display()))?;
+    let dataset = super::open_dataset(&args.data)?;
     let seen = dataset.dataset_sha256() == model.config().provenance.dataset_sha256;
     let runs = evaluation_runs(&dataset, &model)?;
     let evaluation = evaluate(&model, &runs, dataset.dataset_sha256())

@@ -25,6 +25,9 @@ pub enum Command {
     Submit {
         /// Job as JSON
         file: PathBuf,
+        /// Machine file of one's own, in place of the job's machine
+        #[arg(long)]
+        machine: Option<PathBuf>,
         /// BODY=FILE: upload this Abaqus mesh and give it to the job's machine; may be repeated
         #[arg(long, value_parser = mesh_of_body)]
         mesh: Vec<(String, PathBuf)>,
@@ -86,10 +89,11 @@ pub fn run(command: Command) -> anyhow::Result<()> {
     match command {
         Command::Submit {
             file,
+            machine,
             mesh,
             wait,
             service,
-        } => submit(&file, &mesh, wait, &service),
+        } => submit(&file, machine.as_deref(), &mesh, wait, &service),
         Command::List { service } => list(&service),
         Command::Show { job, service } => {
             let status: JobStatus = Client::new(&service.url)?.get(&format!("/v1/jobs/{job}"))?;
@@ -119,6 +123,15 @@ fn mesh_of_body(argument: &str) -> Result<(String, PathBuf), String> {
     }
 }
 
+/// The job with another machine.
+fn with_machine(text: &str, machine: &Path) -> anyhow::Result<String> {
+    let mut job: serde_json::Value = serde_json::from_str(text).context("the job is not JSON")?;
+    let fields = job.as_object_mut().context("the job is not a JSON object")?;
+    let toml = read_text(machine, "machine file")?;
+    fields.insert("machine".to_owned(), serde_json::json!({ "toml": toml }));
+    Ok(job.to_string())
+}
+
 /// The job with the hashes of meshes that are uploaded for it.
 fn with_meshes(client: &Client, text: &str, meshes: &[(String, PathBuf)]) -> anyhow::Result<String> {
     let mut job: serde_json::Value = serde_json::from_str(text).context("the job is not JSON")?;
@@ -141,17 +154,23 @@ fn with_meshes(client: &Client, text: &str, meshes: &[(String, PathBuf)]) -> any
 
 fn submit(
     file: &Path,
+    machine: Option<&Path>,
     meshes: &[(String, PathBuf)],
     wait: bool,
     service: &ServiceArgs,
 ) -> anyhow::Result<()> {
     let mut text = read_text(file, "job")?;
+    if let Some(machine) = machine {
+        text = with_machine(&text, machine)?;
+    }
     let client = Client::new(&service.url)?;
     if !meshes.is_empty() {
         text = with_meshes(&client, &text, meshes)?;
     }
     let status: JobStatus = client.post_text("/v1/jobs", text)?;
     if wait {
+        // At once: who stops waiting, or may not read, still knows which job it is.
+        eprintln!("job {}", status.job_id);
         return watch(&client, &status.job_id.to_string(), service.json);
     }
     print(&status, service.json)

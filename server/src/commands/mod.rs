@@ -25,6 +25,7 @@ mod log;
 
 use anyhow::Context as _;
 use clap::builder::RangedU64ValueParser;
+use hydroflex_dataset::Dataset;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -46,6 +47,15 @@ pub(crate) fn read_text(file: &Path, what: &str) -> anyhow::Result<String> {
             .with_context(|| format!("cannot read the {what} from standard input"));
     }
     std::fs::read_to_string(file).with_context(|| format!("cannot read the {what} {}", file.display()))
+}
+
+/// A data set in a directory, every file as its hash says.
+///
+/// # Errors
+/// If it is damaged or cannot be read.
+pub(crate) fn open_dataset(folder: &Path) -> anyhow::Result<Dataset> {
+    let opened = Dataset::open(folder).and_then(|dataset| dataset.verify().map(|()| dataset));
+    opened.with_context(|| format!("cannot open {}", folder.display()))
 }
 
 /// Prints a line for people to standard output. A closed pipe ends the command instead of a panic.

@@ -141,15 +141,7 @@ fn settings(args: &Args) -> anyhow::Result<RunSettings> {
     );
     ensure!(args.threads != Some(0), "--threads is 0, allowed is 1 or more");
     let step_s = args.step_s.unwrap_or(DEFAULT_STEP_S);
-    let integrator = match (args.integrator, args.step_s) {
-        (IntegratorName::Accurate, None) => Integrator::Accurate,
-        (IntegratorName::Accurate, Some(step_s)) => bail!(
-            "--step-s {step_s} does not go with --integrator accurate, which chooses its steps itself; \
-             it belongs to trapezoidal-index-2 and generalized-alpha"
-        ),
-        (IntegratorName::TrapezoidalIndex2, _) => Integrator::TrapezoidalIndex2 { step_s },
-        (IntegratorName::GeneralizedAlpha, _) => Integrator::GeneralizedAlpha { step_s },
-    };
+    let integrator = integrator(args.integrator, args.step_s)?;
     if integrator != Integrator::Accurate {
         let ratio = args.sample_s / step_s;
         ensure!(
@@ -161,6 +153,23 @@ fn settings(args: &Args) -> anyhow::Result<RunSettings> {
     Ok(RunSettings {
         integrator,
         sample_time_s: args.sample_s,
+    })
+}
+
+/// The scheme of that name with a step, by default of 5 ms.
+///
+/// # Errors
+/// A step for `accurate`, which chooses its own.
+pub(crate) fn integrator(name: IntegratorName, step_s: Option<f64>) -> anyhow::Result<Integrator> {
+    let fixed_s = step_s.unwrap_or(DEFAULT_STEP_S);
+    Ok(match (name, step_s) {
+        (IntegratorName::Accurate, None) => Integrator::Accurate,
+        (IntegratorName::Accurate, Some(step_s)) => bail!(
+            "--step-s {step_s} does not go with --integrator accurate, which chooses its steps itself; \
+             it belongs to trapezoidal-index-2 and generalized-alpha"
+        ),
+        (IntegratorName::TrapezoidalIndex2, _) => Integrator::TrapezoidalIndex2 { step_s: fixed_s },
+        (IntegratorName::GeneralizedAlpha, _) => Integrator::GeneralizedAlpha { step_s: fixed_s },
     })
 }
 

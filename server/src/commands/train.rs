@@ -2,10 +2,11 @@
 
 use crate::calibration;
 use crate::coordinator::machines::CheckedMachine;
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use hydroflex_dataset::Dataset;
 use hydroflex_ml::dataset::load_all;
 use hydroflex_ml::evaluate::table::table;
+use hydroflex_ml::model::write::{Place, place};
 use hydroflex_ml::runs::Runs;
 use hydroflex_ml::train::{Progress, train_dataset};
 use hydroflex_openapi::dataset::DatasetSource;
@@ -21,9 +22,12 @@ pub struct Args {
     /// Data set directory
     #[arg(long)]
     pub data: PathBuf,
-    /// Directory to write the model to
+    /// Directory to write the model to, absent or empty
     #[arg(long)]
     pub out: PathBuf,
+    /// Replace the model that is in that directory
+    #[arg(long)]
+    pub replace: bool,
     /// `best`, or the letters of the paper: L, RLR, TLTLT, TLSLTLSLT, ELE, …, RDLR (with dropout)
     #[arg(long, default_value = "best")]
     pub structure: String,
@@ -84,8 +88,13 @@ pub struct Args {
 /// # Errors
 /// Every failure ends the command with its reason.
 pub fn run(args: Args) -> anyhow::Result<()> {
-    let dataset =
-        Dataset::open(&args.data).with_context(|| format!("cannot open {}", args.data.display()))?;
+    if place(&args.out)? == Place::Model && !args.replace {
+        bail!(
+            "--out {} holds a model; --replace replaces it",
+            args.out.display()
+        );
+    }
+    let dataset = super::open_dataset(&args.data)?;
     let spec = TrainingSpec {
         structure: args.structure,
         inputs: args.inputs,
@@ -112,9 +121,7 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         noise: args.noise,
     };
     let long = match &args.calibration {
-        Some(path) => Some(calm_runs(
-            &Dataset::open(path).with_context(|| format!("cannot open {}", path.display()))?,
-        )?),
+        Some(path) => Some(calm_runs(&super::open_dataset(path)?)?),
         None => simulated(&dataset, &args.mesh),
     };
     let bar = training_bar(args.json);

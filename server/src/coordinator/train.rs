@@ -183,6 +183,7 @@ fn learn(
     cancel: &AtomicBool,
 ) -> Result<Option<CellResult>, TrainError> {
     let dataset = Dataset::open(dataset)?;
+    dataset.verify()?;
     let long = calibration_runs(&dataset, machines, blobs);
     let mut report = |progress: train::Progress| {
         if let Ok(mut latest) = latest.lock() {

@@ -104,7 +104,8 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
         .and_then(|rest| rest.strip_suffix('`'))
         && document
             .pointer(&pointer)
-            .is_some_and(serde_json::Value::is_object)
+            .and_then(serde_json::Value::as_object)
+            .is_some_and(|object| object.contains_key(name))
     {
         pointer.extend(["/", &name.replace('~', "~0").replace('/', "~1")]);
     }
@@ -130,7 +131,9 @@ fn in_words_of_json(expected: &str) -> &str {
         "a sequence" => "a list",
         "a map" => "an object",
         "string or map" => "a string or an object",
-        other if other.starts_with("struct ") || other.starts_with("internally tagged enum ") => "an object",
+        other if other.starts_with("internally tagged enum WindowRule") => "an object with `rule`",
+        other if other.starts_with("internally tagged enum ") => "an object with `kind`",
+        other if other.starts_with("struct ") => "an object",
         other => other,
     }
 }
@@ -356,6 +359,21 @@ mod tests {
             ("", "missing field `runs`")
         );
 
+        let nested = refusal(r#"{"runs": 80, "initial_angle_rad": {"min": 0}}"#);
+        assert_eq!(nested.pointer, "/initial_angle_rad");
+        let range = refusal(r#"{"runs": 80, "payload_kg": [0, 100]}"#);
+        assert_eq!(
+            (range.pointer.as_str(), range.detail.as_str()),
+            ("/payload_kg", "invalid value")
+        );
+        assert!(range.allowed.is_some_and(|allowed| allowed.contains("min")));
+        let step = refusal(r#"{"runs": 80, "integrator": {"kind": "accurate", "step_s": 0.01}}"#);
+        assert_eq!(step.pointer, "/integrator");
+        assert!(
+            step.detail.contains("0.01") && step.allowed.is_some(),
+            "{}",
+            step.detail
+        );
         let object = refusal(r#"{"runs": 80, "train": {}}"#);
         assert_eq!(
             (object.detail.as_str(), object.allowed.as_deref()),

@@ -143,10 +143,16 @@ impl Study<'_> {
         let model_dir = folder.join(name);
         let before = Model::load(&model_dir).ok();
         let before = before.filter(|m| m.config().provenance.dataset_sha256 == training.dataset_sha256());
+        let others: Vec<f64> = self.other_sets().map(|(kg, _)| kg).collect();
         let is_ours = |cell: &Cell| {
             before
                 .as_ref()
                 .is_some_and(|model| cell.cycle.model_sha256 == model.sha256())
+                && cell
+                    .other_payloads
+                    .iter()
+                    .map(|&(kg, _)| kg)
+                    .eq(others.iter().copied())
         };
         if let Some(cells) = self.earlier(asked, is_ours) {
             return Ok(cells);
@@ -316,22 +322,30 @@ impl Study<'_> {
 
     /// Part of the windows outside the envelope, by payload, of the payloads that the model was not trained on.
     fn other_payloads(&self, model: &Model, seed: u64) -> anyhow::Result<Vec<(f64, f64)>> {
-        let Payload::Fixed(own) = self.trained.payload else {
-            return Ok(Vec::new());
-        };
         let mut parts = Vec::new();
-        for set in self.sets.iter().filter(|set| set.runs == self.trained.runs) {
-            if let (Payload::Fixed(kg), Some(evaluation)) = (set.payload, &set.evaluation)
-                && kg.to_bits() != own.to_bits()
-            {
-                let runs = parts_for(model, evaluation, seed, self.args.signals)?.calm;
-                let inside = evaluate(model, &runs, evaluation.dataset_sha256())?
-                    .report
-                    .inside_envelope;
-                parts.extend(inside.map(|inside| (kg, 1.0 - inside)));
-            }
+        for (kg, evaluation) in self.other_sets() {
+            let runs = parts_for(model, evaluation, seed, self.args.signals)?.calm;
+            let inside = evaluate(model, &runs, evaluation.dataset_sha256())?
+                .report
+                .inside_envelope;
+            parts.extend(inside.map(|inside| (kg, 1.0 - inside)));
         }
         Ok(parts)
+    }
+
+    /// The evaluation sets of the payloads that a network for one payload was not trained on.
+    fn other_sets(&self) -> impl Iterator<Item = (f64, &Dataset)> {
+        let own = match self.trained.payload {
+            Payload::Fixed(own) => Some(own),
+            Payload::Range { .. } => None,
+        };
+        let sets = self.sets.iter().filter(|set| set.runs == self.trained.runs);
+        sets.filter_map(move |set| match (own, set.payload, &set.evaluation) {
+            (Some(own), Payload::Fixed(kg), Some(evaluation)) if kg.to_bits() != own.to_bits() => {
+                Some((kg, evaluation))
+            }
+            _ => None,
+        })
     }
 }
 

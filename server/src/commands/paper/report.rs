@@ -168,10 +168,15 @@ fn envelope(text: &mut String, cells: &[Cell]) {
                     )
                 })
         };
-        let others: Vec<String> = (0..head.other_payloads.len())
-            .map(|p| {
-                let flagged = group.iter().filter_map(|c| c.other_payloads.get(p)).map(|o| o.1);
-                format!("{} kg: {}", head.other_payloads[p].0, percents(flagged))
+        let all = || group.iter().flat_map(|cell| &cell.other_payloads);
+        let others: Vec<String> = head
+            .other_payloads
+            .iter()
+            .map(|&(kg, _)| {
+                let flagged = all()
+                    .filter(|other| other.0.to_bits() == kg.to_bits())
+                    .map(|other| other.1);
+                format!("{kg} kg: {}", percents(flagged))
             })
             .collect();
         let _ = writeln!(
@@ -187,25 +192,29 @@ fn envelope(text: &mut String, cells: &[Cell]) {
     }
     text.push_str(
         "\n## Beyond the training region\n\nRandom 10 s runs that hit an end stop, cavitate or leave the supply's pressures: \
-         first target.\n\n| payload | sensors | structure | MAE | p95 | max | least squares MAE | p95 | max | flagged windows |\n\
+         first target, means of the seeds.\n\n| payload | sensors | structure | MAE | p95 | max | least squares MAE | p95 | max | flagged windows |\n\
          |---|---|---|---|---|---|---|---|---|---|\n",
     );
     for group in groups(cells) {
         let head = &group[0];
-        let Some(flagged) = &head.flagged else { continue };
-        let (model, linear) = (&flagged.targets[0], &flagged.baselines[0].targets[0]);
-        let (factor, unit) = display(model);
-        let values = [
-            model.mae, model.p95, model.max, linear.mae, linear.p95, linear.max,
-        ];
+        let flagged: Vec<&EvaluationReport> = group.iter().filter_map(|c| c.flagged.as_ref()).collect();
+        let Some(first) = flagged.first() else { continue };
+        let (factor, unit) = display(&first.targets[0]);
         let _ = write!(text, "| {} |", label(head));
-        for value in values {
-            let _ = write!(text, " {} {unit} |", significant(factor * value));
+        let of_network = |report: &EvaluationReport| report.targets[0].clone();
+        let of_linear = |report: &EvaluationReport| report.baselines[0].targets[0].clone();
+        for metrics in [of_network, of_linear] {
+            let all: Vec<TargetMetrics> = flagged.iter().map(|report| metrics(report)).collect();
+            let sum = all.iter().fold([0.0; 3], |[mae, p95, max], m| {
+                [mae + m.mae, p95 + m.p95, max + m.max]
+            });
+            for value in sum {
+                let mean = value / all.len() as f64;
+                let _ = write!(text, " {} {unit} |", significant(factor * mean));
+            }
         }
-        let outside = flagged
-            .inside_envelope
-            .map_or_else(String::new, |i| percent(1.0 - i));
-        let _ = writeln!(text, " {outside} |");
+        let outside = flagged.iter().filter_map(|report| report.inside_envelope);
+        let _ = writeln!(text, " {} |", percents(outside.map(|inside| 1.0 - inside)));
     }
 }
 

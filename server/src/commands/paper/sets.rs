@@ -9,12 +9,14 @@ use hydroflex_ml::dataset::load_all;
 use hydroflex_ml::evaluate::{EvaluateError, with_noise_of_training};
 use hydroflex_ml::model::Model;
 use hydroflex_ml::runs::Runs;
+use hydroflex_openapi::dataset::DatasetSource;
 use hydroflex_openapi::job::{Excitation, JobSpec, ValueOrRange};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
 use hydroflex_sim::trajectory::RunInput;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 
 /// Length of an evaluation run, s.
@@ -185,7 +187,8 @@ fn data_set(
     runs: Vec<RunInput>,
 ) -> anyhow::Result<Dataset> {
     let out = folder.join(name);
-    if !out.join("manifest.json").exists() {
+    let is_there = out.join("manifest.json").exists();
+    if !is_there {
         let table = folder.join(format!("{name}-runs.parquet"));
         run_table::write(&table, machine.file(), &runs)?;
         simulate::run(simulate::Args {
@@ -201,15 +204,31 @@ fn data_set(
             json: args.json,
         })?;
     }
-    let dataset = Dataset::open(&out).with_context(|| format!("cannot open {}", out.display()))?;
-    let found = dataset.runs().len();
-    ensure!(
-        found == runs.len(),
-        "{} has {found} runs, this study needs {}: choose another --out",
-        out.display(),
-        runs.len()
-    );
+    let dataset = super::super::open_dataset(&out)?;
+    if is_there {
+        let manifest = dataset.manifest();
+        let source = DatasetSource::RunTable {
+            sha256: hash_of_table(folder, machine, &runs)?,
+            integrator: simulate::integrator(args.integrator, None)?,
+        };
+        ensure!(
+            manifest.machine.content_sha256 == hex::encode(machine.content_hash())
+                && manifest.source == source,
+            "{} was made of other runs, another machine or another integrator than this study asks for: choose \
+             another --out, or call as before",
+            out.display()
+        );
+    }
     Ok(dataset)
+}
+
+/// Hash of the table of these runs.
+fn hash_of_table(folder: &Path, machine: &Machine, runs: &[RunInput]) -> anyhow::Result<String> {
+    let table = tempfile::NamedTempFile::new_in(folder)
+        .with_context(|| format!("cannot write in {}", folder.display()))?;
+    run_table::write(table.path(), machine.file(), runs)?;
+    let bytes = std::fs::read(table.path()).context("run table")?;
+    Ok(hex::encode(Sha256::digest(&bytes)))
 }
 
 /// Evaluation runs by kind, with the noise of the model's training.
