@@ -2,14 +2,16 @@
 //! simulation of the next shard, one at a time.
 
 use crate::shard::EncodedShard;
-use hydroflex_ledger::blobs::{BlobError, Blobs};
+use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
 use hydroflex_ledger::{Claim, CommitOutcome, Ledger, LedgerError, ShardResult};
 use std::time::{Duration, Instant};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tracing::Instrument;
 
-/// How long the database or the store may be away before a shard is given back.
+/// How long the database may be away before this worker's name is given up. The store may be away for longer: its
+/// absence says nothing about the runs, so no attempt is charged for it.
 const PATIENCE: Duration = Duration::from_mins(1);
 /// Pause before a commit is tried again.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -24,13 +26,14 @@ pub(crate) struct Delivery {
 struct Office {
     ledger: Ledger,
     blobs: Blobs,
+    stop: watch::Receiver<bool>,
 }
 
 impl Delivery {
-    /// With nothing under way.
-    pub(crate) fn new(ledger: Ledger, blobs: Blobs) -> Self {
+    /// With nothing under way. Once `stop` is true, what the store does not take is given back.
+    pub(crate) fn new(ledger: Ledger, blobs: Blobs, stop: watch::Receiver<bool>) -> Self {
         Self {
-            office: Office { ledger, blobs },
+            office: Office { ledger, blobs, stop },
             under_way: None,
         }
     }
@@ -67,12 +70,7 @@ impl Office {
     async fn deliver(&self, claim: &Claim, encoded: EncodedShard) -> Result<(), LedgerError> {
         let object = claim.object();
         let start = Instant::now();
-        if let Err(error) = self.put(&object, &encoded).await {
-            tracing::warn!(%error, object, "the object could not be put");
-            let reason = format!("the store refused the object: {error}");
-            self.ledger
-                .lose_shard(claim.shard.id, claim.shard.epoch, &reason)
-                .await?;
+        if !self.put(claim, &object, &encoded).await? {
             return Ok(());
         }
         crash_point("put");
@@ -99,18 +97,34 @@ impl Office {
         Ok(())
     }
 
-    async fn put(&self, object: &str, encoded: &EncodedShard) -> Result<(), BlobError> {
-        let start = Instant::now();
+    /// Puts the object, for as long as the shard is ours: to simulate it again would end here too. False if it was
+    /// given back, or is somebody else's by now.
+    async fn put(&self, claim: &Claim, object: &str, encoded: &EncodedShard) -> Result<bool, LedgerError> {
+        let mut stop = self.stop.clone();
         let mut pause = Duration::from_millis(100);
         loop {
             match self.blobs.create(object, encoded.content.clone()).await {
-                Ok(()) => return Ok(()),
+                Ok(()) => return Ok(true),
                 // Nobody else has this name: an earlier try of ours has worked without telling.
-                Err(error) if error.is_already_there() => return Ok(()),
-                Err(error) if start.elapsed() > PATIENCE => return Err(error),
+                Err(error) if error.is_already_there() => return Ok(true),
                 Err(error) => tracing::warn!(%error, object, "put failed; trying again"),
             }
-            tokio::time::sleep(pause).await;
+            if *stop.borrow() {
+                tracing::warn!(
+                    object,
+                    "told to stop before the store took the object; the shard is given back"
+                );
+                self.ledger.release_shard(claim).await?;
+                return Ok(false);
+            }
+            if let Ok(false) = self.ledger.holds(claim).await {
+                tracing::debug!(object, "no longer wanted");
+                return Ok(false);
+            }
+            tokio::select! {
+                _ = stop.wait_for(|stop| *stop) => {}
+                () = tokio::time::sleep(pause) => {}
+            }
             pause = (pause * 2).min(Duration::from_secs(5));
         }
     }
@@ -126,5 +140,83 @@ impl Office {
                 outcome => return outcome,
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hydroflex_ledger::NewJob;
+    use hydroflex_openapi::status::TimeSplit;
+    use std::path::Path;
+
+    /// A claimed shard of two runs, in a new ledger below `folder`.
+    async fn claimed(folder: &Path) -> (Ledger, Claim) {
+        let url = format!("sqlite:{}", folder.join("ledger.sqlite").display());
+        let ledger = Ledger::create(&url).await.unwrap();
+        ledger.register_worker("a", None).await.unwrap();
+        let job = NewJob {
+            spec: serde_json::from_value(serde_json::json!({ "runs": 2, "settling_runs": 0 })).unwrap(),
+            machine_sha256: "00".repeat(32),
+            settling_shards: Vec::new(),
+            run_shards: vec![2],
+            notices: Vec::new(),
+        };
+        ledger.create_job(&job, None).await.unwrap();
+        let claim = ledger.begin_shard("a").await.unwrap().unwrap();
+        (ledger, claim)
+    }
+
+    fn encoded() -> EncodedShard {
+        EncodedShard {
+            content: "samples".into(),
+            sha256: "00".repeat(32),
+            failed_runs: 0,
+            spent: TimeSplit::default(),
+        }
+    }
+
+    /// A store that takes nothing: a file stands where its folder was.
+    fn away(folder: &Path) -> (Blobs, std::path::PathBuf) {
+        let blobs = Blobs::open(&format!("file://{}", folder.join("store").display())).unwrap();
+        let jobs = folder.join("store/jobs");
+        let _ = std::fs::remove_dir_all(&jobs);
+        std::fs::write(&jobs, "in the way").unwrap();
+        (blobs, jobs)
+    }
+
+    #[tokio::test]
+    async fn a_store_that_is_away_costs_no_attempt() {
+        let folder = tempfile::tempdir().unwrap();
+        let (ledger, claim) = claimed(folder.path()).await;
+        let (blobs, in_the_way) = away(folder.path());
+        assert!(
+            blobs.create(&claim.object(), "x".into()).await.is_err(),
+            "it takes nothing"
+        );
+        let (_told, stop) = watch::channel(false);
+        let mut delivery = Delivery::new(ledger.clone(), blobs, stop);
+        delivery.begin(claim.clone(), encoded());
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        assert!(ledger.holds(&claim).await.unwrap(), "still this worker's");
+        std::fs::remove_file(in_the_way).unwrap();
+        delivery.finish().await.unwrap();
+        let progress = ledger.job(claim.job.id).await.unwrap().unwrap().progress;
+        assert_eq!((progress.runs_done, progress.runs_failed), (2, 0));
+    }
+
+    #[tokio::test]
+    async fn who_is_told_to_stop_gives_back_what_the_store_does_not_take() {
+        let folder = tempfile::tempdir().unwrap();
+        let (ledger, claim) = claimed(folder.path()).await;
+        let (blobs, _in_the_way) = away(folder.path());
+        let (told, stop) = watch::channel(false);
+        let mut delivery = Delivery::new(ledger.clone(), blobs, stop);
+        delivery.begin(claim.clone(), encoded());
+        told.send(true).unwrap();
+        delivery.finish().await.unwrap();
+        assert!(!ledger.holds(&claim).await.unwrap());
+        let again = ledger.begin_shard("a").await.unwrap().unwrap();
+        assert_eq!((again.shard.id, again.shard.attempt), (claim.shard.id, 1));
     }
 }

@@ -66,6 +66,8 @@ pub enum ShardFailure {
 pub struct ShardControl {
     /// Set to stop before the next run.
     pub stop: AtomicBool,
+    /// Set when the machine is ready and runs begin.
+    pub begun: AtomicBool,
     /// Runs done: a number that stands still means a run that hangs.
     pub runs_done: AtomicU64,
 }
@@ -81,6 +83,7 @@ pub fn make(
     pool: &rayon::ThreadPool,
     control: &ShardControl,
 ) -> Result<EncodedShard, ShardFailure> {
+    control.begun.store(true, Ordering::Relaxed);
     let spec = &claim.job.spec;
     let kind = match claim.shard.kind {
         ShardKind::Runs => RunKind::Job,

@@ -22,6 +22,8 @@ const BEAT: Duration = Duration::from_secs(1);
 const LOOK: Duration = Duration::from_millis(500);
 /// How long the database or the store may be away before this process gives up.
 const PATIENCE: Duration = Duration::from_mins(1);
+/// Pause after the store did not give what a shard needs.
+const STORE_PAUSE: Duration = Duration::from_secs(2);
 
 /// How a worker works.
 #[derive(Debug, Clone)]
@@ -115,6 +117,9 @@ pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::
             Err(error) if error.is_transient() => {
                 tracing::warn!(worker = name, %error, "the database is away; trying again");
                 tokio::time::sleep(BEAT).await;
+                // What this name may hold without knowing it (a claim whose answer was lost) is free at once; if this
+                // does not get through either, when its lease is over.
+                let _ = worker.ledger.give_up_worker(&name, "it lost the database").await;
             }
             Err(error) => return Err(error.into()),
         }
@@ -163,7 +168,7 @@ impl Worker {
     ) -> Result<Option<Ended>, LedgerError> {
         let longest_idle = self.ledger.longest_idle();
         let mut idle = longest_idle / 4;
-        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone());
+        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone(), self.stop.clone());
         // The job of the last shard and when this process was done with it: what passes until the next
         // shard of the same job is time that the job's worker waits.
         let mut last: Option<(JobId, Instant)> = None;
@@ -210,11 +215,12 @@ impl Worker {
                     }
                     idle = (idle * 2).min(longest_idle);
                 }
-                Err(error) if error.is_transient() => {
-                    tracing::warn!(%error, "the database is away; trying again");
-                    tokio::time::sleep(BEAT).await;
+                // A transient error too: the claim may have been made and its answer lost. The shard would then be in the
+                // hands of a worker that lives and does not know it, for as long as this name lives.
+                Err(error) => {
+                    delivery.finish().await?;
+                    return Err(error);
                 }
-                Err(error) => return Err(error),
             }
         }
     }
@@ -259,16 +265,28 @@ impl Worker {
             Simulated::Fenced => tracing::debug!("no longer wanted"),
             Simulated::Spoiled { reason } => {
                 tracing::error!(reason, "attempt lost, and this process with it");
-                self.ledger.lose_shard(shard.id, shard.epoch, &reason).await?;
+                // Whatever the database says: this process must not take another shard.
+                if let Err(error) = self.ledger.lose_shard(shard.id, shard.epoch, &reason).await {
+                    tracing::warn!(%error, "the attempt is lost when the lease is over");
+                }
                 return Ok(true);
             }
             Simulated::Lost(reason) => {
                 tracing::warn!(reason, "attempt lost");
                 self.ledger.lose_shard(shard.id, shard.epoch, &reason).await?;
             }
+            Simulated::StoreAway(reason) => {
+                tracing::warn!(reason, "the shard is given back until the store is there");
+                self.ledger.release_shard(claim).await?;
+                let mut stop = self.stop.clone();
+                tokio::select! {
+                    _ = stop.wait_for(|stop| *stop) => {}
+                    () = tokio::time::sleep(STORE_PAUSE) => {}
+                }
+            }
             Simulated::Impossible(reason) => {
                 tracing::error!(reason, "the job cannot be simulated");
-                self.ledger.fail_job(shard.job_id, &reason).await?;
+                self.ledger.fail_job_of(claim, &reason).await?;
             }
         }
         Ok(false)
@@ -283,7 +301,7 @@ impl Worker {
                 let machine = match machines.ready(&claim.job.spec, &blobs) {
                     Ok(machine) => machine,
                     Err(refused @ RefusedMachine::Store { .. }) => {
-                        return Err(Simulated::Lost(refused.to_string()));
+                        return Err(Simulated::StoreAway(refused.to_string()));
                     }
                     Err(refused) => return Err(Simulated::Impossible(refused.to_string())),
                 };
@@ -334,7 +352,8 @@ impl Worker {
                         control.stop.store(true, Ordering::Relaxed);
                     }
                     let runs_done = control.runs_done.load(Ordering::Relaxed);
-                    if runs_done != progress.0 {
+                    // To make the machine ready (a mesh from the store, its reduction) is no run.
+                    if runs_done != progress.0 || !control.begun.load(Ordering::Relaxed) {
                         progress = (runs_done, Instant::now());
                     } else if progress.1.elapsed() > self.limits.time {
                         let reason = format!(
@@ -355,6 +374,7 @@ enum Simulated {
     Fenced,
     Spoiled { reason: String },
     Lost(String),
+    StoreAway(String),
     Impossible(String),
 }
 

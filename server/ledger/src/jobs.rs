@@ -3,7 +3,7 @@
 use crate::engine::{Transaction, values};
 use crate::events::append;
 use crate::record::JobRecord;
-use crate::{Ledger, LedgerError, ShardKind, clock, shards};
+use crate::{Claim, Ledger, LedgerError, ShardKind, clock, shards};
 use hydroflex_openapi::event::EventKind;
 use hydroflex_openapi::id::JobId;
 use hydroflex_openapi::job::JobSpec;
@@ -326,8 +326,36 @@ impl Ledger {
         self.end_job(job, JobState::Failed, reason).await
     }
 
-    async fn end_job(&self, job: JobId, state: JobState, reason: &str) -> Result<bool, LedgerError> {
+    /// Ends the job of a shard in hand that nobody can simulate. False if the shard is no longer in hand, or the job
+    /// was over already.
+    ///
+    /// # Errors
+    /// What the database says.
+    pub async fn fail_job_of(&self, claim: &Claim, reason: &str) -> Result<bool, LedgerError> {
         let mut tx = self.pool.begin().await?;
+        let held = tx
+            .execute(
+                "UPDATE shards SET state = 'cancelled' WHERE id = $1 AND epoch = $2 AND state = 'running'",
+                values![claim.shard.id.to_string(), claim.shard.epoch],
+            )
+            .await?;
+        if held == 0 {
+            return Ok(false);
+        }
+        Self::end_job_in(tx, claim.shard.job_id, JobState::Failed, reason).await
+    }
+
+    async fn end_job(&self, job: JobId, state: JobState, reason: &str) -> Result<bool, LedgerError> {
+        let tx = self.pool.begin().await?;
+        Self::end_job_in(tx, job, state, reason).await
+    }
+
+    async fn end_job_in(
+        mut tx: Transaction,
+        job: JobId,
+        state: JobState,
+        reason: &str,
+    ) -> Result<bool, LedgerError> {
         // Shards and trainings before the job, as in every other transaction: two of them that lock
         // the same rows in different order would wait for each other. A shard planned in between
         // stays open, but nobody begins a shard of a job that is over.

@@ -98,8 +98,10 @@ async fn serve(
                 }
             }
             Ok(None) => {}
+            // The claim may have been made and its answer lost: this name is given up, and another one begins.
             Err(error) if error.is_transient() => {
-                tracing::warn!(%error, "the database is away; trying again");
+                tracing::warn!(%error, "the database is away; starting anew");
+                return Ok(());
             }
             Err(error) => return Err(error.into()),
         }

@@ -10,6 +10,8 @@ on_every_engine![
     a_commit_of_an_old_epoch_is_fenced,
     a_repeated_commit_is_the_same_commit,
     a_released_shard_loses_no_attempt,
+    a_claim_whose_answer_was_lost_is_free_when_its_worker_is_given_up,
+    only_who_holds_a_shard_fails_its_job,
     a_bad_run_is_isolated,
     a_worker_that_is_given_up_holds_nothing,
     of_two_planners_one_wins,
@@ -107,6 +109,35 @@ async fn a_released_shard_loses_no_attempt(ledger: Ledger) {
         assert!(ledger.release_shard(&claim).await.unwrap());
         assert!(!ledger.release_shard(&claim).await.unwrap());
     }
+}
+
+async fn a_claim_whose_answer_was_lost_is_free_when_its_worker_is_given_up(ledger: Ledger) {
+    ledger.create_job(&new_job(&[4]), None).await.unwrap();
+    // As the worker sees it: the database went away. It asks under another name and finds nothing, ...
+    let forgotten = ledger.begin_shard("a").await.unwrap().unwrap();
+    assert!(ledger.begin_shard("b").await.unwrap().is_none());
+    // ... until its old name is given up.
+    ledger.give_up_worker("a", "it lost the database").await.unwrap();
+    let claim = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert_eq!((claim.shard.id, claim.shard.attempt), (forgotten.shard.id, 2));
+    assert!(!ledger.holds(&forgotten).await.unwrap());
+}
+
+async fn only_who_holds_a_shard_fails_its_job(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4, 4]), None).await.unwrap().id();
+    let old = ledger.begin_shard("a").await.unwrap().unwrap();
+    ledger.give_up_worker("a", "silent").await.unwrap();
+    let claim = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert!(!ledger.fail_job_of(&old, "another build").await.unwrap());
+    assert!(ledger.holds(&claim).await.unwrap());
+    assert!(ledger.fail_job_of(&claim, "no such mesh").await.unwrap());
+    assert!(!ledger.holds(&claim).await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(
+        (job.state, job.reason.as_deref()),
+        (JobState::Failed, Some("no such mesh"))
+    );
+    assert!(ledger.begin_shard("b").await.unwrap().is_none());
 }
 
 async fn a_bad_run_is_isolated(ledger: Ledger) {
