@@ -148,7 +148,7 @@ mod tests {
     use super::*;
     use hydroflex_ledger::NewJob;
     use hydroflex_openapi::status::TimeSplit;
-    use std::path::Path;
+    use std::path::{Path, PathBuf};
 
     /// A claimed shard of two runs, in a new ledger below `folder`.
     async fn claimed(folder: &Path) -> (Ledger, Claim) {
@@ -176,20 +176,22 @@ mod tests {
         }
     }
 
-    /// A store that takes nothing: a file stands where its folder was.
-    fn away(folder: &Path) -> (Blobs, std::path::PathBuf) {
+    /// A store that takes nothing of a claim: a file stands where a folder would be.
+    fn away(folder: &Path, claim: &Claim) -> (Blobs, PathBuf) {
         let blobs = Blobs::open(&format!("file://{}", folder.join("store").display())).unwrap();
-        let jobs = folder.join("store/jobs");
-        let _ = std::fs::remove_dir_all(&jobs);
-        std::fs::write(&jobs, "in the way").unwrap();
-        (blobs, jobs)
+        let object = claim.object();
+        let in_the_way = folder
+            .join("store")
+            .join(object.split('/').next().unwrap_or_default());
+        std::fs::write(&in_the_way, "in the way").unwrap();
+        (blobs, in_the_way)
     }
 
     #[tokio::test]
     async fn a_store_that_is_away_costs_no_attempt() {
         let folder = tempfile::tempdir().unwrap();
         let (ledger, claim) = claimed(folder.path()).await;
-        let (blobs, in_the_way) = away(folder.path());
+        let (blobs, in_the_way) = away(folder.path(), &claim);
         assert!(
             blobs.create(&claim.object(), "x".into()).await.is_err(),
             "it takes nothing"
@@ -209,7 +211,7 @@ mod tests {
     async fn who_is_told_to_stop_gives_back_what_the_store_does_not_take() {
         let folder = tempfile::tempdir().unwrap();
         let (ledger, claim) = claimed(folder.path()).await;
-        let (blobs, _in_the_way) = away(folder.path());
+        let (blobs, _in_the_way) = away(folder.path(), &claim);
         let (told, stop) = watch::channel(false);
         let mut delivery = Delivery::new(ledger.clone(), blobs, stop);
         delivery.begin(claim.clone(), encoded());
