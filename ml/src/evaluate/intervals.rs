@@ -6,12 +6,15 @@
 
 use hydroflex_openapi::model::IntervalTable;
 
-/// Part of the true values inside.
-pub const LEVEL: f64 = 0.9;
 /// Classes of amplitude, of equal numbers of validation windows.
 const CLASSES: usize = 3;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
+
+/// ⌈0.9 (n + 1)⌉ of n errors, in whole numbers: 0.9 is none of the binary ones, and would be rounded up.
+fn rank(errors: usize) -> usize {
+    (9 * (errors + 1)).div_ceil(10).min(errors)
+}
 
 /// Table for one target; absent when there are too few windows.
 #[must_use]
@@ -31,8 +34,8 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
     for class in 0..classes {
         let (from, to) = (class * pairs.len() / classes, (class + 1) * pairs.len() / classes);
         let mut errors: Vec<f64> = pairs[from..to].iter().map(|p| p.1).collect();
-        let corrected = LEVEL * (1.0 + 1.0 / errors.len() as f64);
-        half_widths.push(super::metrics::quantile(&mut errors, corrected.min(1.0)));
+        let place = rank(errors.len()) - 1;
+        half_widths.push(*errors.select_nth_unstable_by(place, f64::total_cmp).1);
         if class + 1 < classes {
             upper_edges.push(pairs[to - 1].0);
         }
@@ -47,6 +50,13 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ranks_are_those_of_whole_numbers() {
+        for (errors, expected) in [(60, 55), (69, 63), (70, 64), (79, 72), (99, 90), (9, 9), (3, 3)] {
+            assert_eq!(rank(errors), expected, "{errors}");
+        }
+    }
 
     #[test]
     fn errors_that_grow_get_wider_intervals_that_still_cover() {

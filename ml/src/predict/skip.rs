@@ -110,6 +110,13 @@ impl SkipKernel {
                     .collect()
             },
         );
+        // What the vector code relies on.
+        assert_eq!(
+            outputs,
+            exponents.len() * targets,
+            "an output for each coefficient and target"
+        );
+        assert!(inputs >= channels.len(), "a window of a sample or more");
         Self {
             inputs,
             targets,

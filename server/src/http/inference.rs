@@ -28,6 +28,8 @@ pub const BODY_LIMIT_BYTES: usize = 64 << 20;
 const INLINE_WINDOWS: usize = 512;
 /// Bodies with bytes up to here are read on the spot.
 const INLINE_BODY_BYTES: usize = 1 << 20;
+/// JSON before bytes that is no large part of anybody's work.
+const SMALL_TEXT_BYTES: usize = 1 << 10;
 /// JSON bodies up to here are read on the spot: a millisecond or two.
 const INLINE_TEXT_BYTES: usize = 256 << 10;
 /// Version of a model that is asked for by its content: it has no other.
@@ -400,9 +402,12 @@ async fn estimate(
     // Windows at most, before the body is read: four bytes a value.
     let window_bytes = 4 * named.model.predictor().window_len().max(1);
     let most = 1 + body.len() / window_bytes;
+    // By what the body is, whatever the header says: text takes longer than as many bytes.
     let (work, most_bytes) = match json_length {
-        Some(_) => (Work::Bytes, INLINE_BODY_BYTES),
-        None => (Work::Text, INLINE_TEXT_BYTES),
+        Some(length) if length <= body.len() / 2 || length <= SMALL_TEXT_BYTES => {
+            (Work::Bytes, INLINE_BODY_BYTES)
+        }
+        _ => (Work::Text, INLINE_TEXT_BYTES),
     };
     let answer = if body.len() <= most_bytes && most <= INLINE_WINDOWS {
         let _ticket = state.gate().inline(work, body.len()).await?;

@@ -492,7 +492,7 @@ enum Values<'a> {
 /// Estimates for a checked batch.
 ///
 /// # Errors
-/// If the answer cannot be written as JSON, which only a model that gives no finite number causes.
+/// If the model gives no finite number.
 pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> Result<Answer, String> {
     let predictor = model.predictor();
     let targets = predictor.target_count();
@@ -517,6 +517,15 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
             }
         }
     });
+    // JSON has no such number, and as bytes it would be no better an answer.
+    if let Some(place) = estimates.iter().position(|y| !y.is_finite()) {
+        return Err(format!(
+            "the model gives no finite number for window {} (target {}): its inputs are far outside of what it was \
+             trained on",
+            place / targets,
+            place % targets
+        ));
+    }
     let bound = |sign: f64| -> Vec<f64> {
         estimates
             .iter()

@@ -30,6 +30,10 @@ pub(super) fn apart(json: &[u8], deepest: usize) -> Option<(Vec<u8>, Vec<f64>)> 
         }
         let end = string_end(json, at)?;
         let colon = skip_space(json, end);
+        // A key may be written otherwise (`"d\u0061ta"`): whoever does so is read by the full parser.
+        if json.get(colon) == Some(&b':') && json[at..end].contains(&b'\\') {
+            return None;
+        }
         if &json[at..end] != KEY || json.get(colon) != Some(&b':') {
             at = end;
             continue;
@@ -192,6 +196,12 @@ mod tests {
             read("[-0, 0.12345678, 0.1234567812345678]").map(|v| v[0].to_bits()),
             Some((-0.0_f64).to_bits())
         );
+    }
+
+    #[test]
+    fn a_key_that_is_written_otherwise_is_left_to_others() {
+        let text = br#"{"parameters": {"data": [1]}, "inputs": [{"d\u0061ta": [2]}]}"#;
+        assert_eq!(apart(text, 3), None);
     }
 
     #[test]
