@@ -46,6 +46,11 @@ impl Delivery {
         self.under_way = Some(tokio::spawn(deliver.in_current_span()));
     }
 
+    /// Whether a shard may still be on its way.
+    pub(crate) fn is_under_way(&self) -> bool {
+        self.under_way.as_ref().is_some_and(|task| !task.is_finished())
+    }
+
     /// Waits for what is under way.
     ///
     /// # Errors

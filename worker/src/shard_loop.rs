@@ -189,8 +189,10 @@ impl Worker {
                     // A death is charged to every shard in hand. One that has met a death is alone in hand, so
                     // that no shard is charged twice for what another does.
                     let alone = claim.shard.attempt > 1;
-                    if alone {
+                    if alone && delivery.is_under_way() {
+                        self.ledger.release_shard(&claim).await?;
                         delivery.finish().await?;
+                        continue;
                     }
                     let since = match last {
                         Some((job, at)) if job == claim.job.id => at,

@@ -64,8 +64,9 @@ pub fn crash_point(point: &str) {
         Ok("eat") => {
             let mut eaten: Vec<Vec<u8>> = Vec::new();
             loop {
-                eaten.push(vec![1; 16 << 20]);
-                std::thread::sleep(std::time::Duration::from_millis(5));
+                // Slowly enough to be seen on a busy machine: the kernel's limit says no reason.
+                eaten.push(vec![1; 4 << 20]);
+                std::thread::sleep(std::time::Duration::from_millis(10));
             }
         }
         _ => {}
