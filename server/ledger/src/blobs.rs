@@ -174,10 +174,14 @@ impl Blobs {
     /// What the store said last; at once if no patience would help.
     pub async fn wait_until_there(&self, patience: Duration) -> Result<(), BlobError> {
         let start = Instant::now();
+        let mut has_said = false;
         loop {
             match self.ping().await {
                 Err(error) if error.is_transient() && start.elapsed() < patience => {
-                    tracing::debug!(%error, "waiting for the store");
+                    if !has_said {
+                        tracing::warn!(%error, "the store does not answer; trying for {} s", patience.as_secs());
+                    }
+                    has_said = true;
                 }
                 answer => return answer,
             }

@@ -4,7 +4,7 @@
 //! `RETURNING`, `ON CONFLICT`); [`Engine`] tells the few places where they differ.
 
 use crate::LedgerError;
-use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
 };
@@ -173,12 +173,12 @@ macro_rules! bind_all {
     }};
 }
 
-/// What a single attempt to reach PostgreSQL ends with.
-async fn why_not(url: &str) -> sqlx::Error {
-    match tokio::time::timeout(Duration::from_secs(5), PgConnection::connect(url)).await {
-        Ok(Err(error)) => error,
-        Ok(Ok(_)) | Err(_) => sqlx::Error::PoolTimedOut,
-    }
+/// A single attempt to reach PostgreSQL.
+async fn once(options: &PgConnectOptions) -> Result<(), sqlx::Error> {
+    let attempt = async { PgConnection::connect_with(options).await?.close().await };
+    tokio::time::timeout(Duration::from_secs(5), attempt)
+        .await
+        .unwrap_or(Err(sqlx::Error::PoolTimedOut))
 }
 
 impl Pool {
@@ -204,18 +204,32 @@ impl Pool {
         } else if url.starts_with("postgres:") || url.starts_with("postgresql:") {
             // A machine that is cut off in the middle of a transaction holds its locks until the server
             // gives it up, by default after two hours: every other worker would wait for it.
+            // Once by itself: the pool would try for long without a word.
+            let options = PgConnectOptions::from_str(url)?;
+            if let Err(error) = once(&options).await {
+                tracing::warn!(
+                    host = options.get_host(),
+                    port = options.get_port(),
+                    %error,
+                    "the database does not answer; trying for {} s",
+                    BUSY_TIMEOUT.as_secs()
+                );
+            }
             let pool = PgPoolOptions::new()
                 .max_connections(connections)
                 .acquire_timeout(BUSY_TIMEOUT)
                 .after_connect(|connection, _| {
                     Box::pin(async move { connection.execute(GIVE_UP_THE_SILENT).await.map(drop) })
                 })
-                .connect(url)
+                .connect_with(options.clone())
                 .await;
             match pool {
                 Ok(pool) => Ok(Self::Postgres(pool)),
                 // The pool has tried again and again, and does not say what stood in the way.
-                Err(sqlx::Error::PoolTimedOut) => Err(why_not(url).await.into()),
+                Err(sqlx::Error::PoolTimedOut) => {
+                    once(&options).await?;
+                    Err(sqlx::Error::PoolTimedOut.into())
+                }
                 Err(error) => Err(error.into()),
             }
         } else {

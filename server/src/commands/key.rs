@@ -72,7 +72,10 @@ async fn work(command: Command) -> anyhow::Result<()> {
             scopes.sort_unstable();
             scopes.dedup();
             let expires_ms = days.map(|days| clock::now_ms() + i64::from(days) * 86_400_000);
-            let (key, record) = open(&args).await?.create_key(&title, &scopes, expires_ms).await?;
+            let (key, record) = open(&args, true)
+                .await?
+                .create_key(&title, &scopes, expires_ms)
+                .await?;
             if args.json {
                 let mut shown = as_json(&record);
                 shown["key"] = key.into();
@@ -82,7 +85,7 @@ async fn work(command: Command) -> anyhow::Result<()> {
             super::print_line(format_args!("{key}"))
         }
         Command::List { ledger: args } => {
-            let keys = open(&args).await?.keys().await?;
+            let keys = open(&args, false).await?.keys().await?;
             if args.json {
                 return super::print_json(&keys.iter().map(as_json).collect::<Vec<_>>());
             }
@@ -102,7 +105,7 @@ async fn work(command: Command) -> anyhow::Result<()> {
             Ok(())
         }
         Command::Revoke { key, ledger: args } => {
-            if open(&args).await?.revoke_key(key).await? {
+            if open(&args, false).await?.revoke_key(key).await? {
                 super::print_line(format_args!("revoked {key}"))
             } else {
                 bail!("no key {key}, or it was revoked before")
@@ -111,18 +114,31 @@ async fn work(command: Command) -> anyhow::Result<()> {
     }
 }
 
-/// A database that is not there yet is made: keys may come before the first start of the service.
-async fn open(args: &LedgerArgs) -> anyhow::Result<Ledger> {
+/// A database that is not there yet is made for a new key only: keys may come before the first start of the service.
+async fn open(args: &LedgerArgs, makes: bool) -> anyhow::Result<Ledger> {
     let url = if let Some(url) = &args.database {
         url.clone()
     } else {
+        let file = args.data.join("ledger.sqlite");
+        if !file.exists() {
+            if !makes {
+                bail!(
+                    "no service has its data in {}; --data names its directory",
+                    args.data.display()
+                );
+            }
+            eprintln!(
+                "note: there is no service's data in {} yet; the key is for one that is started with the same --data",
+                args.data.display()
+            );
+        }
         std::fs::create_dir_all(&args.data).with_context(|| {
             format!(
                 "cannot make {}; --data names the service's directory",
                 args.data.display()
             )
         })?;
-        format!("sqlite:{}", args.data.join("ledger.sqlite").display())
+        format!("sqlite:{}", file.display())
     };
     Ledger::create(&url).await.context("cannot open the database")
 }
