@@ -202,8 +202,6 @@ impl Pool {
                 .await?;
             Ok(Self::Sqlite(pool))
         } else if url.starts_with("postgres:") || url.starts_with("postgresql:") {
-            // A machine that is cut off in the middle of a transaction holds its locks until the server
-            // gives it up, by default after two hours: every other worker would wait for it.
             // Once by itself: the pool would try for long without a word.
             let options = PgConnectOptions::from_str(url)?;
             if let Err(error) = once(&options).await {
@@ -218,6 +216,8 @@ impl Pool {
             let pool = PgPoolOptions::new()
                 .max_connections(connections)
                 .acquire_timeout(BUSY_TIMEOUT)
+                // A machine that is cut off in the middle of a transaction holds its locks until the server
+                // gives it up, by default after two hours: every other worker would wait for it.
                 .after_connect(|connection, _| {
                     Box::pin(async move { connection.execute(GIVE_UP_THE_SILENT).await.map(drop) })
                 })
