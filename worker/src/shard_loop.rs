@@ -106,11 +106,12 @@ pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::
     let deadline = config.drain_after.map(|after| Instant::now() + after);
     for life in 1.. {
         let name = identity::worker_name("worker", life);
-        match worker.live(&name, deadline).await {
-            Ok(Some(ended)) => {
-                let _ = worker.ledger.give_up_worker(&name, "its worker stopped").await;
-                return Ok(ended);
-            }
+        let ended = worker.live(&name, deadline).await;
+        // A claim whose answer was lost is in nobody's hands as long as this name counts as alive. If the
+        // database is still away, the beats that stop here say the same a lease later.
+        let _ = worker.ledger.give_up_worker(&name, "its worker stopped").await;
+        match ended {
+            Ok(Some(ended)) => return Ok(ended),
             Ok(None) => tracing::warn!(worker = name, "was given up by the coordinator; starting over"),
             Err(error) if error.is_transient() => {
                 tracing::warn!(worker = name, %error, "the database is away; trying again");
@@ -150,9 +151,18 @@ impl Worker {
         self.ledger.register_worker(name, Some(level)).await?;
         let alive = Arc::new(AtomicBool::new(true));
         let heart = tokio::spawn(beat(self.ledger.clone(), name.to_owned(), alive.clone()));
-        let ended = self.claim_and_work(name, deadline, &alive).await;
+        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone());
+        let ended = self.claim_and_work(name, deadline, &alive, &mut delivery).await;
+        let delivered = if matches!(ended, Ok(Some(Ended::Spoiled))) {
+            // It may hold memory that this process has not got, so not for long.
+            let _ = tokio::time::timeout(BEAT, delivery.finish()).await;
+            Ok(())
+        } else {
+            // Also after an error: what is on its way is simulated, and needs this name alive to count.
+            delivery.finish().await
+        };
         heart.abort();
-        ended
+        ended.and_then(|ended| delivered.map(|()| ended))
     }
 
     async fn claim_and_work(
@@ -160,25 +170,25 @@ impl Worker {
         name: &str,
         deadline: Option<Instant>,
         alive: &AtomicBool,
+        delivery: &mut Delivery,
     ) -> Result<Option<Ended>, LedgerError> {
         let longest_idle = self.ledger.longest_idle();
         let mut idle = longest_idle / 4;
-        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone());
         // The job of the last shard and when this process was done with it: what passes until the next
         // shard of the same job is time that the job's worker waits.
         let mut last: Option<(JobId, Instant)> = None;
         loop {
             if self.told_to_stop() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
-                delivery.finish().await?;
                 return Ok(Some(Ended::Drained));
             }
             if !alive.load(Ordering::Relaxed) {
-                delivery.finish().await?;
                 return Ok(None);
             }
             let asked = Instant::now();
-            match self.ledger.begin_shard(name).await {
-                Ok(Some(claim)) => {
+            // After an error nobody knows whether a shard was begun: it ends this life, so that none stays in
+            // the hands of a name that beats and knows nothing of it.
+            match self.ledger.begin_shard(name).await? {
+                Some(claim) => {
                     crash_point("begin");
                     idle = longest_idle / 4;
                     // A death is charged to every shard in hand. One that has met a death is alone in hand, so
@@ -191,9 +201,7 @@ impl Worker {
                         Some((job, at)) if job == claim.job.id => at,
                         _ => asked,
                     };
-                    if self.do_shard(&claim, since.elapsed(), &mut delivery).await? {
-                        // It may hold memory that this process has not got, so not for long.
-                        let _ = tokio::time::timeout(BEAT, delivery.finish()).await;
+                    if self.do_shard(&claim, since.elapsed(), delivery).await? {
                         return Ok(Some(Ended::Spoiled));
                     }
                     last = Some((claim.job.id, Instant::now()));
@@ -201,7 +209,7 @@ impl Worker {
                         delivery.finish().await?;
                     }
                 }
-                Ok(None) => {
+                None => {
                     delivery.finish().await?;
                     let mut stop = self.stop.clone();
                     tokio::select! {
@@ -210,11 +218,6 @@ impl Worker {
                     }
                     idle = (idle * 2).min(longest_idle);
                 }
-                Err(error) if error.is_transient() => {
-                    tracing::warn!(%error, "the database is away; trying again");
-                    tokio::time::sleep(BEAT).await;
-                }
-                Err(error) => return Err(error),
             }
         }
     }
@@ -259,7 +262,10 @@ impl Worker {
             Simulated::Fenced => tracing::debug!("no longer wanted"),
             Simulated::Spoiled { reason } => {
                 tracing::error!(reason, "attempt lost, and this process with it");
-                self.ledger.lose_shard(shard.id, shard.epoch, &reason).await?;
+                // Told or not, this process is not to go on: the end of its worker says the same.
+                if let Err(error) = self.ledger.lose_shard(shard.id, shard.epoch, &reason).await {
+                    tracing::warn!(%error, "the loss cannot be reported");
+                }
                 return Ok(true);
             }
             Simulated::Lost(reason) => {

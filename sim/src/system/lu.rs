@@ -122,7 +122,10 @@ widest! {
 }
 
 /// Sum of products in four strands: one strand would wait for every addition.
-#[allow(clippy::inline_always, reason = "part of a function that enables wide instructions")]
+#[allow(
+    clippy::inline_always,
+    reason = "part of a function that enables wide instructions"
+)]
 #[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut strands = [0.0; 4];

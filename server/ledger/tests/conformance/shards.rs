@@ -12,6 +12,7 @@ on_every_engine![
     a_released_shard_loses_no_attempt,
     a_bad_run_is_isolated,
     a_worker_that_is_given_up_holds_nothing,
+    a_claim_whose_answer_was_lost_is_begun_again,
     of_two_planners_one_wins,
     a_shard_whose_object_is_lost_is_done_again,
     many_workers_share_without_overlap,
@@ -167,6 +168,26 @@ async fn a_worker_that_is_given_up_holds_nothing(ledger: Ledger) {
     assert_eq!((again.shard.id, again.shard.attempt), (claim.shard.id, 2));
     assert_eq!(again.shard.reason.as_deref(), Some("gone"));
     assert_eq!(ledger.recover_lost("gone").await.unwrap(), 0);
+}
+
+async fn a_claim_whose_answer_was_lost_is_begun_again(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4]), None).await.unwrap().id();
+    // The connection broke after the claim was committed: its worker knows only that it has nothing.
+    drop(ledger.begin_shard("a").await.unwrap().unwrap());
+    assert!(ledger.begin_shard("a").await.unwrap().is_none());
+    ledger.give_up_worker("a", "its worker stopped").await.unwrap();
+    ledger
+        .register_worker("a-again", Some("x86-64-v3"))
+        .await
+        .unwrap();
+    let claim = ledger.begin_shard("a-again").await.unwrap().unwrap();
+    assert_eq!((claim.shard.epoch, claim.shard.attempt), (2, 2));
+    let outcome = ledger
+        .commit_shard(&claim, &result(&claim.object()))
+        .await
+        .unwrap();
+    assert_eq!(outcome, CommitOutcome::Committed);
+    assert!(ledger.job(id).await.unwrap().unwrap().is_complete());
 }
 
 async fn of_two_planners_one_wins(ledger: Ledger) {
