@@ -1,6 +1,7 @@
 //! A shard on its way: its object into the store, then the commit that makes it count. It goes beside the
 //! simulation of the next shard, one at a time.
 
+use crate::outage::Outage;
 use crate::shard::EncodedShard;
 use hydroflex_ledger::blobs::{BlobError, Blobs};
 use hydroflex_ledger::crash::crash_point;
@@ -9,30 +10,54 @@ use std::time::{Duration, Instant};
 use tokio::task::JoinHandle;
 use tracing::Instrument;
 
-/// How long the database or the store may be away before a shard is given back.
-const PATIENCE: Duration = Duration::from_mins(1);
 /// Pause before a commit is tried again.
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Takes finished shards away.
 pub(crate) struct Delivery {
     office: Office,
-    under_way: Option<JoinHandle<Result<(), LedgerError>>>,
+    under_way: Option<JoinHandle<Result<Put, LedgerError>>>,
+    outage: Outage,
+}
+
+/// What became of a shard's object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Put {
+    Taken,
+    /// The store did not take it for so long that the shard was given back.
+    Refused,
 }
 
 #[derive(Clone)]
 struct Office {
     ledger: Ledger,
     blobs: Blobs,
+    patience: Duration,
 }
 
 impl Delivery {
-    /// With nothing under way.
-    pub(crate) fn new(ledger: Ledger, blobs: Blobs) -> Self {
+    /// With nothing under way. The database or the store may be away for `patience` before a shard is given
+    /// back.
+    pub(crate) fn new(ledger: Ledger, blobs: Blobs, patience: Duration) -> Self {
         Self {
-            office: Office { ledger, blobs },
+            office: Office {
+                ledger,
+                blobs,
+                patience,
+            },
             under_way: None,
+            outage: Outage::new(patience),
         }
+    }
+
+    /// True while the object of a shard is on its way.
+    pub(crate) fn is_under_way(&self) -> bool {
+        self.under_way.is_some()
+    }
+
+    /// What the store has refused lately.
+    pub(crate) fn outage(&mut self) -> &mut Outage {
+        &mut self.outage
     }
 
     /// Sends a shard off. The one before must have arrived ([`Delivery::finish`]).
@@ -54,7 +79,13 @@ impl Delivery {
         let arrived = under_way.await;
         self.under_way = None;
         match arrived {
-            Ok(outcome) => outcome,
+            Ok(put) => {
+                match put? {
+                    Put::Taken => self.outage.over(),
+                    Put::Refused => self.outage.refused(),
+                }
+                Ok(())
+            }
             Err(error) if error.is_panic() => std::panic::resume_unwind(error.into_panic()),
             // Only a runtime that ends cancels it: nobody is left to be told.
             Err(_) => Ok(()),
@@ -64,16 +95,14 @@ impl Delivery {
 
 impl Office {
     /// Puts the object, then commits: in this order, so that what is committed is there.
-    async fn deliver(&self, claim: &Claim, encoded: EncodedShard) -> Result<(), LedgerError> {
+    async fn deliver(&self, claim: &Claim, encoded: EncodedShard) -> Result<Put, LedgerError> {
         let object = claim.object();
         let start = Instant::now();
         if let Err(error) = self.put(&object, &encoded).await {
-            tracing::warn!(%error, object, "the object could not be put");
-            let reason = format!("the store refused the object: {error}");
-            self.ledger
-                .lose_shard(claim.shard.id, claim.shard.epoch, &reason)
-                .await?;
-            return Ok(());
+            // The runs have no part in it, so it is no attempt of theirs.
+            tracing::warn!(%error, object, "the object could not be put; giving the shard back");
+            self.ledger.release_shard(claim).await?;
+            return Ok(Put::Refused);
         }
         crash_point("put");
         let mut spent = encoded.spent;
@@ -96,7 +125,7 @@ impl Office {
                 }
             }
         }
-        Ok(())
+        Ok(Put::Taken)
     }
 
     async fn put(&self, object: &str, encoded: &EncodedShard) -> Result<(), BlobError> {
@@ -107,7 +136,7 @@ impl Office {
                 Ok(()) => return Ok(()),
                 // Nobody else has this name: an earlier try of ours has worked without telling.
                 Err(error) if error.is_already_there() => return Ok(()),
-                Err(error) if start.elapsed() > PATIENCE => return Err(error),
+                Err(error) if start.elapsed() > self.patience => return Err(error),
                 Err(error) => tracing::warn!(%error, object, "put failed; trying again"),
             }
             tokio::time::sleep(pause).await;
@@ -119,7 +148,7 @@ impl Office {
         let start = Instant::now();
         loop {
             match self.ledger.commit_shard(claim, result).await {
-                Err(error) if error.is_transient() && start.elapsed() < PATIENCE => {
+                Err(error) if error.is_transient() && start.elapsed() < self.patience => {
                     tracing::warn!(%error, "commit failed; trying again");
                     tokio::time::sleep(PAUSE).await;
                 }

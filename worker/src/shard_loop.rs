@@ -4,6 +4,7 @@ use crate::delivery::Delivery;
 use crate::machines::{Machines, RefusedMachine};
 use crate::memory;
 use crate::shard::{self, EncodedShard, ShardControl, ShardFailure};
+use crate::standstill::Standstill;
 use anyhow::Context;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
@@ -67,12 +68,36 @@ pub enum Ended {
     Spoiled,
 }
 
+/// Why a worker's life under one name ended.
+#[derive(Debug, thiserror::Error)]
+enum LifeError {
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
+    #[error(
+        "this build's machine of job {job} has SHA-256 {found}, the job was accepted with {accepted}: the shard is \
+         given back; workers must be of the coordinator's build"
+    )]
+    OtherMachine {
+        job: JobId,
+        found: String,
+        accepted: String,
+    },
+}
+
+impl LifeError {
+    fn is_transient(&self) -> bool {
+        matches!(self, Self::Ledger(error) if error.is_transient())
+    }
+}
+
 struct Worker {
     ledger: Ledger,
     blobs: Blobs,
     machines: Arc<Machines>,
     pool: Arc<rayon::ThreadPool>,
     limits: RunLimits,
+    /// How long the database or the store may be away before a shard is given back.
+    patience: Duration,
     stop: watch::Receiver<bool>,
 }
 
@@ -100,6 +125,7 @@ pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::
         machines: Arc::new(Machines::new(config.cache)),
         pool: Arc::new(pool),
         limits: config.limits,
+        patience: PATIENCE,
         ledger,
         stop,
     };
@@ -146,12 +172,12 @@ async fn connect(url: &str, mut stop: watch::Receiver<bool>) -> anyhow::Result<O
 
 impl Worker {
     /// Works under one name. `None` if the name was given up by the coordinator.
-    async fn live(&self, name: &str, deadline: Option<Instant>) -> Result<Option<Ended>, LedgerError> {
+    async fn live(&self, name: &str, deadline: Option<Instant>) -> Result<Option<Ended>, LifeError> {
         let level = hydroflex_sim::instruction_set::level();
         self.ledger.register_worker(name, Some(level)).await?;
         let alive = Arc::new(AtomicBool::new(true));
         let heart = tokio::spawn(beat(self.ledger.clone(), name.to_owned(), alive.clone()));
-        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone());
+        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone(), self.patience);
         let ended = self.claim_and_work(name, deadline, &alive, &mut delivery).await;
         let delivered = if matches!(ended, Ok(Some(Ended::Spoiled))) {
             // It may hold memory that this process has not got, so not for long.
@@ -162,7 +188,9 @@ impl Worker {
             delivery.finish().await
         };
         heart.abort();
-        ended.and_then(|ended| delivered.map(|()| ended))
+        let ended = ended?;
+        delivered?;
+        Ok(ended)
     }
 
     async fn claim_and_work(
@@ -171,7 +199,7 @@ impl Worker {
         deadline: Option<Instant>,
         alive: &AtomicBool,
         delivery: &mut Delivery,
-    ) -> Result<Option<Ended>, LedgerError> {
+    ) -> Result<Option<Ended>, LifeError> {
         let longest_idle = self.ledger.longest_idle();
         let mut idle = longest_idle / 4;
         // The job of the last shard and when this process was done with it: what passes until the next
@@ -184,6 +212,16 @@ impl Worker {
             if !alive.load(Ordering::Relaxed) {
                 return Ok(None);
             }
+            if delivery.outage().pause().is_some() {
+                // Simulated for a store that still refuses what came before, a shard would be lost work.
+                delivery.finish().await?;
+                if let Some(pause) = delivery.outage().pause() {
+                    self.pause(pause).await;
+                    if self.told_to_stop() {
+                        continue;
+                    }
+                }
+            }
             let asked = Instant::now();
             // After an error nobody knows whether a shard was begun: it ends this life, so that none stays in
             // the hands of a name that beats and knows nothing of it.
@@ -192,10 +230,12 @@ impl Worker {
                     crash_point("begin");
                     idle = longest_idle / 4;
                     // A death is charged to every shard in hand. One that has met a death is alone in hand, so
-                    // that no shard is charged twice for what another does.
-                    let alone = claim.shard.attempt > 1;
-                    if alone {
+                    // that no shard is charged twice for what another does; whoever has free hands may take it.
+                    let alone = claim.shard.was_tried_before();
+                    if alone && delivery.is_under_way() {
+                        self.ledger.release_shard(&claim).await?;
                         delivery.finish().await?;
+                        continue;
                     }
                     let since = match last {
                         Some((job, at)) if job == claim.job.id => at,
@@ -211,14 +251,19 @@ impl Worker {
                 }
                 None => {
                     delivery.finish().await?;
-                    let mut stop = self.stop.clone();
-                    tokio::select! {
-                        _ = stop.wait_for(|stop| *stop) => {}
-                        () = tokio::time::sleep(idle) => {}
-                    }
+                    self.pause(idle).await;
                     idle = (idle * 2).min(longest_idle);
                 }
             }
+        }
+    }
+
+    /// Sleeps, unless told to stop.
+    async fn pause(&self, pause: Duration) {
+        let mut stop = self.stop.clone();
+        tokio::select! {
+            _ = stop.wait_for(|stop| *stop) => {}
+            () = tokio::time::sleep(pause) => {}
         }
     }
 
@@ -232,7 +277,7 @@ impl Worker {
         claim: &Claim,
         waited: Duration,
         delivery: &mut Delivery,
-    ) -> Result<bool, LedgerError> {
+    ) -> Result<bool, LifeError> {
         let shard = &claim.shard;
         let span = tracing::info_span!(
             "shard", job = %shard.job_id, kind = %shard.kind, first_run = shard.first_run, runs = shard.run_count,
@@ -246,7 +291,7 @@ impl Worker {
         claim: &Claim,
         waited: Duration,
         delivery: &mut Delivery,
-    ) -> Result<bool, LedgerError> {
+    ) -> Result<bool, LifeError> {
         let shard = &claim.shard;
         tracing::debug!("begun");
         match self.simulate(claim).await {
@@ -258,6 +303,11 @@ impl Worker {
             }
             Simulated::Stopped => {
                 self.ledger.release_shard(claim).await?;
+            }
+            Simulated::StoreAway(reason) => {
+                tracing::warn!(reason, "giving the shard back");
+                self.ledger.release_shard(claim).await?;
+                delivery.outage().refused();
             }
             Simulated::Fenced => tracing::debug!("no longer wanted"),
             Simulated::Spoiled { reason } => {
@@ -274,7 +324,15 @@ impl Worker {
             }
             Simulated::Impossible(reason) => {
                 tracing::error!(reason, "the job cannot be simulated");
-                self.ledger.fail_job(shard.job_id, &reason).await?;
+                self.ledger.fail_job_of(claim, &reason).await?;
+            }
+            Simulated::OtherMachine { found } => {
+                self.ledger.release_shard(claim).await?;
+                return Err(LifeError::OtherMachine {
+                    job: shard.job_id,
+                    found,
+                    accepted: claim.job.machine_sha256.clone(),
+                });
             }
         }
         Ok(false)
@@ -289,15 +347,14 @@ impl Worker {
                 let machine = match machines.ready(&claim.job.spec, &blobs) {
                     Ok(machine) => machine,
                     Err(refused @ RefusedMachine::Store { .. }) => {
-                        return Err(Simulated::Lost(refused.to_string()));
+                        return Err(Simulated::StoreAway(refused.to_string()));
                     }
                     Err(refused) => return Err(Simulated::Impossible(refused.to_string())),
                 };
                 if machine.sha256 != claim.job.machine_sha256 {
-                    return Err(Simulated::Impossible(format!(
-                        "this build's machine has SHA-256 {}, the job was accepted with {}",
-                        machine.sha256, claim.job.machine_sha256
-                    )));
+                    return Err(Simulated::OtherMachine {
+                        found: machine.sha256.clone(),
+                    });
                 }
                 shard::make(&claim, &machine, &pool, &control).map_err(|failure| match failure {
                     ShardFailure::Stopped => Simulated::Stopped,
@@ -310,7 +367,7 @@ impl Worker {
         });
         let mut stop = self.stop.clone();
         let mut fenced = false;
-        let mut progress = (0, Instant::now());
+        let mut standstill = Standstill::new(Instant::now());
         loop {
             tokio::select! {
                 done = &mut work => {
@@ -339,10 +396,8 @@ impl Worker {
                         fenced = true;
                         control.stop.store(true, Ordering::Relaxed);
                     }
-                    let runs_done = control.runs_done.load(Ordering::Relaxed);
-                    if runs_done != progress.0 {
-                        progress = (runs_done, Instant::now());
-                    } else if progress.1.elapsed() > self.limits.time {
+                    if standstill.is_too_long(Instant::now(), &control, self.limits.time) {
+                        let runs_done = control.runs_done.load(Ordering::Relaxed);
                         let reason = format!(
                             "a run took longer than {} s, after {runs_done} runs of the shard",
                             self.limits.time.as_secs_f64()
@@ -359,9 +414,18 @@ enum Simulated {
     Done(EncodedShard),
     Stopped,
     Fenced,
-    Spoiled { reason: String },
+    /// The store does not give what the runs need.
+    StoreAway(String),
+    Spoiled {
+        reason: String,
+    },
     Lost(String),
+    /// No build can simulate the job.
     Impossible(String),
+    /// This build's machine is not the one that the job was accepted with.
+    OtherMachine {
+        found: String,
+    },
 }
 
 async fn beat(ledger: Ledger, name: String, alive: Arc<AtomicBool>) {
@@ -377,3 +441,6 @@ async fn beat(ledger: Ledger, name: String, alive: Arc<AtomicBool>) {
         tokio::time::sleep(BEAT).await;
     }
 }
+
+#[cfg(test)]
+mod tests;
