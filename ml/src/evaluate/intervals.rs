@@ -6,8 +6,8 @@
 
 use hydroflex_openapi::model::IntervalTable;
 
-/// Part of the true values inside.
-pub const LEVEL: f64 = 0.9;
+/// Part of the true values inside, in tenths.
+const LEVEL_TENTHS: usize = 9;
 /// Classes of amplitude, of equal numbers of validation windows.
 const CLASSES: usize = 3;
 /// Fewest windows in a class.
@@ -31,8 +31,8 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
     for class in 0..classes {
         let (from, to) = (class * pairs.len() / classes, (class + 1) * pairs.len() / classes);
         let mut errors: Vec<f64> = pairs[from..to].iter().map(|p| p.1).collect();
-        let corrected = LEVEL * (1.0 + 1.0 / errors.len() as f64);
-        half_widths.push(super::metrics::quantile(&mut errors, corrected.min(1.0)));
+        errors.sort_by(f64::total_cmp);
+        half_widths.push(errors[rank(errors.len()) - 1]);
         if class + 1 < classes {
             upper_edges.push(pairs[to - 1].0);
         }
@@ -44,9 +44,23 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
     })
 }
 
+/// ⌈0.9 (n + 1)⌉, at most n. In integers: a product that is whole must not be rounded up to the next.
+fn rank(errors: usize) -> usize {
+    (LEVEL_TENTHS * (errors + 1)).div_ceil(10).min(errors)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_rank_is_exact_where_the_product_is_whole() {
+        assert_eq!([1, 9, 10, 19, 60].map(rank), [1, 9, 10, 18, 55]);
+        for tens in 1..100_000 {
+            assert_eq!(rank(10 * tens - 1), 9 * tens);
+            assert_eq!(rank(10 * tens), 9 * tens + 1);
+        }
+    }
 
     #[test]
     fn errors_that_grow_get_wider_intervals_that_still_cover() {
