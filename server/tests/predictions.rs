@@ -556,6 +556,27 @@ async fn an_alias_moves_between_models_and_earlier_ones_stay() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_model_waits_for_the_store_rather_than_forget_its_simulator() {
+    let desk = Desk::new().await;
+    let id = desk.register(&synthetic("RLR", 6)).await;
+    let predict = async || {
+        desk.send(
+            "POST",
+            &format!("/v1/models/{id}/predict"),
+            &[("content-type", "application/json")],
+            Body::from(columns(12).to_string()),
+        )
+        .await
+    };
+    // A file in place of the directory: the store neither has the data sets nor says that it has none.
+    let in_the_way = desk.blobs.local_path("datasets").unwrap();
+    std::fs::write(&in_the_way, "").unwrap();
+    predict().await.problem(503);
+    std::fs::remove_file(&in_the_way).unwrap();
+    assert_eq!(predict().await.status, 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_bad_model_never_replaces_a_good_one() {
     let desk = Desk::new().await;
     let good = desk.register(&synthetic("RLR", 6)).await;

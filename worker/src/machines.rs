@@ -1,6 +1,6 @@
 //! Machines by reference: loaded, checked and reduced once per process, and once per cache directory.
 
-use hydroflex_ledger::blobs::{BlobError, Blobs, mesh_key};
+use hydroflex_ledger::blobs::{Blobs, mesh_key};
 use hydroflex_openapi::job::{JobSpec, MachineRef, MaterialRef, ValueOrRange};
 use hydroflex_openapi::machine::MaterialSpec;
 use hydroflex_openapi::problem::FieldError;
@@ -192,7 +192,10 @@ fn fetch(meshes: &BTreeMap<String, String>, blobs: &Blobs) -> Result<MeshTexts, 
         };
         let key = mesh_key(sha256).ok_or_else(no_mesh)?;
         let content = runtime.block_on(blobs.read(&key, sha256)).map_err(|error| {
-            if matches!(&error, BlobError::Store(_)) && error.is_loss() {
+            // One that is damaged will be no better the next time: there is none of this hash. A directory that
+            // is gone as a whole may come back.
+            let away = blobs.local_path("").is_some_and(|root| !root.is_dir());
+            if error.is_loss() && !away {
                 no_mesh()
             } else {
                 RefusedMachine::Store {

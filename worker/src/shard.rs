@@ -66,10 +66,18 @@ pub enum ShardFailure {
 pub struct ShardControl {
     /// Set to stop before the next run.
     pub stop: AtomicBool,
-    /// Set when the machine is ready and runs begin.
-    pub begun: AtomicBool,
     /// Runs done: a number that stands still means a run that hangs.
     pub runs_done: AtomicU64,
+    /// Most runs that a thread has under way before it counts them, so how many run times may pass until
+    /// `runs_done` moves; 0 until the first run begins.
+    pub counted_together: AtomicU64,
+}
+
+impl ShardControl {
+    /// Says that a thread begins runs that it will count together.
+    pub(crate) fn begin(&self, runs: u64) {
+        self.counted_together.fetch_max(runs, Ordering::Relaxed);
+    }
 }
 
 /// Simulates and encodes the runs of a claim, on the threads of `pool`. The bytes do not depend on
@@ -83,7 +91,6 @@ pub fn make(
     pool: &rayon::ThreadPool,
     control: &ShardControl,
 ) -> Result<EncodedShard, ShardFailure> {
-    control.begun.store(true, Ordering::Relaxed);
     let spec = &claim.job.spec;
     let kind = match claim.shard.kind {
         ShardKind::Runs => RunKind::Job,
@@ -192,6 +199,7 @@ fn simulate_whole(
     if control.stop.load(Ordering::Relaxed) {
         return Err(ShardFailure::Stopped);
     }
+    control.begin(1);
     for index in runs {
         crash_point_of("run", *index);
     }
@@ -200,6 +208,7 @@ fn simulate_whole(
         .map(|index| plan(spec, machine, kind, *index))
         .collect::<Result<Vec<_>, ShardFailure>>()?;
     if run::side_by_side(&planned, spec, machine) {
+        control.begin(runs.len() as u64);
         let together = catch_unwind(AssertUnwindSafe(|| {
             run::simulate_together(planned, spec, machine)
         }));

@@ -4,6 +4,7 @@ use crate::delivery::Delivery;
 use crate::machines::{Machines, RefusedMachine};
 use crate::memory;
 use crate::shard::{self, EncodedShard, ShardControl, ShardFailure};
+use crate::standstill::Standstill;
 use anyhow::Context;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
@@ -22,8 +23,6 @@ const BEAT: Duration = Duration::from_secs(1);
 const LOOK: Duration = Duration::from_millis(500);
 /// How long the database or the store may be away before this process gives up.
 const PATIENCE: Duration = Duration::from_mins(1);
-/// Pause after the store did not give what a shard needs.
-const STORE_PAUSE: Duration = Duration::from_secs(2);
 
 /// How a worker works.
 #[derive(Debug, Clone)]
@@ -75,6 +74,8 @@ struct Worker {
     machines: Arc<Machines>,
     pool: Arc<rayon::ThreadPool>,
     limits: RunLimits,
+    /// How long the database or the store may be away before a shard is given back.
+    patience: Duration,
     stop: watch::Receiver<bool>,
 }
 
@@ -102,24 +103,23 @@ pub async fn work(config: WorkerConfig, stop: watch::Receiver<bool>) -> anyhow::
         machines: Arc::new(Machines::new(config.cache)),
         pool: Arc::new(pool),
         limits: config.limits,
+        patience: PATIENCE,
         ledger,
         stop,
     };
     let deadline = config.drain_after.map(|after| Instant::now() + after);
     for life in 1.. {
         let name = identity::worker_name("worker", life);
-        match worker.live(&name, deadline).await {
-            Ok(Some(ended)) => {
-                let _ = worker.ledger.give_up_worker(&name, "its worker stopped").await;
-                return Ok(ended);
-            }
+        let ended = worker.live(&name, deadline).await;
+        // A claim whose answer was lost is in nobody's hands as long as this name counts as alive. If the
+        // database is still away, the beats that stop here say the same a lease later.
+        let _ = worker.ledger.give_up_worker(&name, "its worker stopped").await;
+        match ended {
+            Ok(Some(ended)) => return Ok(ended),
             Ok(None) => tracing::warn!(worker = name, "was given up by the coordinator; starting over"),
             Err(error) if error.is_transient() => {
                 tracing::warn!(worker = name, %error, "the database is away; trying again");
                 tokio::time::sleep(BEAT).await;
-                // What this name may hold without knowing it (a claim whose answer was lost) is free at once; if this
-                // does not get through either, when its lease is over.
-                let _ = worker.ledger.give_up_worker(&name, "it lost the database").await;
             }
             Err(error) => return Err(error.into()),
         }
@@ -155,9 +155,20 @@ impl Worker {
         self.ledger.register_worker(name, Some(level)).await?;
         let alive = Arc::new(AtomicBool::new(true));
         let heart = tokio::spawn(beat(self.ledger.clone(), name.to_owned(), alive.clone()));
-        let ended = self.claim_and_work(name, deadline, &alive).await;
+        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone(), self.patience);
+        let ended = self.claim_and_work(name, deadline, &alive, &mut delivery).await;
+        let delivered = if matches!(ended, Ok(Some(Ended::Spoiled))) {
+            // It may hold memory that this process has not got, so not for long.
+            let _ = tokio::time::timeout(BEAT, delivery.finish()).await;
+            Ok(())
+        } else {
+            // Also after an error: what is on its way is simulated, and needs this name alive to count.
+            delivery.finish().await
+        };
         heart.abort();
-        ended
+        let ended = ended?;
+        delivered?;
+        Ok(ended)
     }
 
     async fn claim_and_work(
@@ -165,30 +176,40 @@ impl Worker {
         name: &str,
         deadline: Option<Instant>,
         alive: &AtomicBool,
+        delivery: &mut Delivery,
     ) -> Result<Option<Ended>, LedgerError> {
         let longest_idle = self.ledger.longest_idle();
         let mut idle = longest_idle / 4;
-        let mut delivery = Delivery::new(self.ledger.clone(), self.blobs.clone(), self.stop.clone());
         // The job of the last shard and when this process was done with it: what passes until the next
         // shard of the same job is time that the job's worker waits.
         let mut last: Option<(JobId, Instant)> = None;
         loop {
             if self.told_to_stop() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
-                delivery.finish().await?;
                 return Ok(Some(Ended::Drained));
             }
             if !alive.load(Ordering::Relaxed) {
-                delivery.finish().await?;
                 return Ok(None);
             }
+            if delivery.outage().pause().is_some() {
+                // Simulated for a store that still refuses what came before, a shard would be lost work.
+                delivery.finish().await?;
+                if let Some(pause) = delivery.outage().pause() {
+                    self.pause(pause).await;
+                    if self.told_to_stop() {
+                        continue;
+                    }
+                }
+            }
             let asked = Instant::now();
-            match self.ledger.begin_shard(name).await {
-                Ok(Some(claim)) => {
+            // After an error nobody knows whether a shard was begun: it ends this life, so that none stays in
+            // the hands of a name that beats and knows nothing of it.
+            match self.ledger.begin_shard(name).await? {
+                Some(claim) => {
                     crash_point("begin");
                     idle = longest_idle / 4;
                     // A death is charged to every shard in hand. One that has met a death is alone in hand, so
-                    // that no shard is charged twice for what another does.
-                    let alone = claim.shard.attempt > 1;
+                    // that no shard is charged twice for what another does; whoever has free hands may take it.
+                    let alone = claim.shard.was_tried_before();
                     if alone && delivery.is_under_way() {
                         self.ledger.release_shard(&claim).await?;
                         delivery.finish().await?;
@@ -198,9 +219,7 @@ impl Worker {
                         Some((job, at)) if job == claim.job.id => at,
                         _ => asked,
                     };
-                    if self.do_shard(&claim, since.elapsed(), &mut delivery).await? {
-                        // It may hold memory that this process has not got, so not for long.
-                        let _ = tokio::time::timeout(BEAT, delivery.finish()).await;
+                    if self.do_shard(&claim, since.elapsed(), delivery).await? {
                         return Ok(Some(Ended::Spoiled));
                     }
                     last = Some((claim.job.id, Instant::now()));
@@ -208,22 +227,21 @@ impl Worker {
                         delivery.finish().await?;
                     }
                 }
-                Ok(None) => {
+                None => {
                     delivery.finish().await?;
-                    let mut stop = self.stop.clone();
-                    tokio::select! {
-                        _ = stop.wait_for(|stop| *stop) => {}
-                        () = tokio::time::sleep(idle) => {}
-                    }
+                    self.pause(idle).await;
                     idle = (idle * 2).min(longest_idle);
                 }
-                // A transient error too: the claim may have been made and its answer lost. The shard would then be in the
-                // hands of a worker that lives and does not know it, for as long as this name lives.
-                Err(error) => {
-                    delivery.finish().await?;
-                    return Err(error);
-                }
             }
+        }
+    }
+
+    /// Sleeps, unless told to stop.
+    async fn pause(&self, pause: Duration) {
+        let mut stop = self.stop.clone();
+        tokio::select! {
+            _ = stop.wait_for(|stop| *stop) => {}
+            () = tokio::time::sleep(pause) => {}
         }
     }
 
@@ -264,27 +282,23 @@ impl Worker {
             Simulated::Stopped => {
                 self.ledger.release_shard(claim).await?;
             }
+            Simulated::StoreAway(reason) => {
+                tracing::warn!(reason, "giving the shard back");
+                self.ledger.release_shard(claim).await?;
+                delivery.outage().refused();
+            }
             Simulated::Fenced => tracing::debug!("no longer wanted"),
             Simulated::Spoiled { reason } => {
                 tracing::error!(reason, "attempt lost, and this process with it");
-                // Whatever the database says: this process must not take another shard.
+                // Told or not, this process is not to go on: the end of its worker says the same.
                 if let Err(error) = self.ledger.lose_shard(shard.id, shard.epoch, &reason).await {
-                    tracing::warn!(%error, "the attempt is lost when the lease is over");
+                    tracing::warn!(%error, "the loss cannot be reported");
                 }
                 return Ok(true);
             }
             Simulated::Lost(reason) => {
                 tracing::warn!(reason, "attempt lost");
                 self.ledger.lose_shard(shard.id, shard.epoch, &reason).await?;
-            }
-            Simulated::StoreAway(reason) => {
-                tracing::warn!(reason, "the shard is given back until the store is there");
-                self.ledger.release_shard(claim).await?;
-                let mut stop = self.stop.clone();
-                tokio::select! {
-                    _ = stop.wait_for(|stop| *stop) => {}
-                    () = tokio::time::sleep(STORE_PAUSE) => {}
-                }
             }
             Simulated::Impossible(reason) => {
                 tracing::error!(reason, "the job cannot be simulated");
@@ -324,7 +338,7 @@ impl Worker {
         });
         let mut stop = self.stop.clone();
         let mut fenced = false;
-        let mut progress = (0, Instant::now());
+        let mut standstill = Standstill::new(Instant::now());
         loop {
             tokio::select! {
                 done = &mut work => {
@@ -353,11 +367,8 @@ impl Worker {
                         fenced = true;
                         control.stop.store(true, Ordering::Relaxed);
                     }
-                    let runs_done = control.runs_done.load(Ordering::Relaxed);
-                    // To make the machine ready (a mesh from the store, its reduction) is no run.
-                    if runs_done != progress.0 || !control.begun.load(Ordering::Relaxed) {
-                        progress = (runs_done, Instant::now());
-                    } else if progress.1.elapsed() > self.limits.time {
+                    if standstill.is_too_long(Instant::now(), &control, self.limits.time) {
+                        let runs_done = control.runs_done.load(Ordering::Relaxed);
                         let reason = format!(
                             "a run took longer than {} s, after {runs_done} runs of the shard",
                             self.limits.time.as_secs_f64()
@@ -374,9 +385,13 @@ enum Simulated {
     Done(EncodedShard),
     Stopped,
     Fenced,
-    Spoiled { reason: String },
-    Lost(String),
+    /// The store does not give what the runs need.
     StoreAway(String),
+    Spoiled {
+        reason: String,
+    },
+    Lost(String),
+    /// No build can simulate the job.
     Impossible(String),
 }
 
@@ -393,3 +408,6 @@ async fn beat(ledger: Ledger, name: String, alive: Arc<AtomicBool>) {
         tokio::time::sleep(BEAT).await;
     }
 }
+
+#[cfg(test)]
+mod tests;

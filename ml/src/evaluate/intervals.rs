@@ -6,15 +6,12 @@
 
 use hydroflex_openapi::model::IntervalTable;
 
+/// Part of the true values inside, in tenths.
+const LEVEL_TENTHS: usize = 9;
 /// Classes of amplitude, of equal numbers of validation windows.
 const CLASSES: usize = 3;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
-
-/// ⌈0.9 (n + 1)⌉ of n errors, in whole numbers: 0.9 is none of the binary ones, and would be rounded up.
-fn rank(errors: usize) -> usize {
-    (9 * (errors + 1)).div_ceil(10).min(errors)
-}
 
 /// Table for one target; absent when there are too few windows.
 #[must_use]
@@ -34,8 +31,8 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
     for class in 0..classes {
         let (from, to) = (class * pairs.len() / classes, (class + 1) * pairs.len() / classes);
         let mut errors: Vec<f64> = pairs[from..to].iter().map(|p| p.1).collect();
-        let place = rank(errors.len()) - 1;
-        half_widths.push(*errors.select_nth_unstable_by(place, f64::total_cmp).1);
+        errors.sort_by(f64::total_cmp);
+        half_widths.push(errors[rank(errors.len()) - 1]);
         if class + 1 < classes {
             upper_edges.push(pairs[to - 1].0);
         }
@@ -47,14 +44,21 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
     })
 }
 
+/// ⌈0.9 (n + 1)⌉, at most n. In integers: a product that is whole must not be rounded up to the next.
+fn rank(errors: usize) -> usize {
+    (LEVEL_TENTHS * (errors + 1)).div_ceil(10).min(errors)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn ranks_are_those_of_whole_numbers() {
-        for (errors, expected) in [(60, 55), (69, 63), (70, 64), (79, 72), (99, 90), (9, 9), (3, 3)] {
-            assert_eq!(rank(errors), expected, "{errors}");
+    fn the_rank_is_exact_where_the_product_is_whole() {
+        assert_eq!([1, 9, 10, 19, 60].map(rank), [1, 9, 10, 18, 55]);
+        for tens in 1..100_000 {
+            assert_eq!(rank(10 * tens - 1), 9 * tens);
+            assert_eq!(rank(10 * tens), 9 * tens + 1);
         }
     }
 

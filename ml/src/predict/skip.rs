@@ -60,7 +60,7 @@ impl SkipKernel {
     /// Packs a map; without a schedule it is one term with constant coefficients.
     ///
     /// # Panics
-    /// When weights and biases do not fit.
+    /// When weights, biases, schedule, channels and targets do not fit: the vector code trusts them.
     #[must_use]
     pub fn new(
         map: &SkipWeights,
@@ -71,6 +71,13 @@ impl SkipKernel {
         let outputs = map.bias.len();
         let inputs = map.weight.len() / outputs.max(1);
         assert_eq!(map.weight.len(), outputs * inputs, "weights fit biases");
+        let terms = schedule.map_or(1, |schedule| schedule.exponents.len());
+        assert_eq!(
+            outputs,
+            terms * targets,
+            "one output for each term of each target"
+        );
+        assert!(inputs >= channels.len(), "a window has a sample of every channel");
         let (groups, tiles) = if outputs <= NARROW {
             let mut tiles = Vec::new();
             for row in map.weight.chunks(inputs.max(1)) {
@@ -110,13 +117,6 @@ impl SkipKernel {
                     .collect()
             },
         );
-        // What the vector code relies on.
-        assert_eq!(
-            outputs,
-            exponents.len() * targets,
-            "an output for each coefficient and target"
-        );
-        assert!(inputs >= channels.len(), "a window of a sample or more");
         Self {
             inputs,
             targets,
@@ -583,6 +583,34 @@ mod tests {
             kernel.add_panel_at(level, &panel, &places, rows, &mut scratch, &mut many);
             assert_eq!(few, many, "{level:?}");
         }
+    }
+
+    /// A map of six inputs and so many outputs, for three terms.
+    fn of_three_terms(outputs: usize, channels: usize, targets: usize) -> SkipKernel {
+        let map = SkipWeights {
+            weight: vec![1.0; outputs * 6],
+            bias: vec![0.0; outputs],
+        };
+        let schedule = Schedule {
+            inputs: vec![0],
+            centre: vec![0.0],
+            half_range: vec![1.0],
+            exponents: vec![vec![0], vec![1], vec![2]],
+        };
+        SkipKernel::new(&map, Some(&schedule), &vec![channel(0.0, 1.0); channels], targets)
+    }
+
+    #[test]
+    #[should_panic(expected = "one output for each term of each target")]
+    fn a_map_of_too_few_outputs_is_refused() {
+        assert_eq!(of_three_terms(6, 2, 2).padded(), 8);
+        let _ = of_three_terms(5, 2, 2);
+    }
+
+    #[test]
+    #[should_panic(expected = "a window has a sample of every channel")]
+    fn a_window_of_less_than_a_sample_is_refused() {
+        let _ = of_three_terms(6, 7, 2);
     }
 
     #[test]

@@ -314,7 +314,7 @@ impl Ledger {
     /// # Errors
     /// [`LedgerError::NoJob`]; what the database says.
     pub async fn cancel_job(&self, job: JobId) -> Result<bool, LedgerError> {
-        self.end_job(job, JobState::Cancelled, "cancelled on request")
+        self.end_job(job, JobState::Cancelled, "cancelled on request", None)
             .await
     }
 
@@ -323,39 +323,45 @@ impl Ledger {
     /// # Errors
     /// [`LedgerError::NoJob`]; what the database says.
     pub async fn fail_job(&self, job: JobId, reason: &str) -> Result<bool, LedgerError> {
-        self.end_job(job, JobState::Failed, reason).await
+        self.end_job(job, JobState::Failed, reason, None).await
     }
 
-    /// Ends the job of a shard in hand that nobody can simulate. False if the shard is no longer in hand, or the job
-    /// was over already.
+    /// Ends the job of a claim that shows that it cannot be simulated. False if the claim is no longer
+    /// valid, or the job was over already.
     ///
     /// # Errors
-    /// What the database says.
+    /// Passes on what the database says.
     pub async fn fail_job_of(&self, claim: &Claim, reason: &str) -> Result<bool, LedgerError> {
-        let mut tx = self.pool.begin().await?;
-        let held = tx
-            .execute(
-                "UPDATE shards SET state = 'cancelled' WHERE id = $1 AND epoch = $2 AND state = 'running'",
-                values![claim.shard.id.to_string(), claim.shard.epoch],
-            )
-            .await?;
-        if held == 0 {
-            return Ok(false);
-        }
-        Self::end_job_in(tx, claim.shard.job_id, JobState::Failed, reason).await
+        self.end_job(claim.shard.job_id, JobState::Failed, reason, Some(claim))
+            .await
     }
 
-    async fn end_job(&self, job: JobId, state: JobState, reason: &str) -> Result<bool, LedgerError> {
-        let tx = self.pool.begin().await?;
-        Self::end_job_in(tx, job, state, reason).await
-    }
-
-    async fn end_job_in(
-        mut tx: Transaction,
+    async fn end_job(
+        &self,
         job: JobId,
         state: JobState,
         reason: &str,
+        only_while_held: Option<&Claim>,
     ) -> Result<bool, LedgerError> {
+        let mut tx = self.pool.begin().await?;
+        if let Some(claim) = only_while_held {
+            // Written to take their locks, all in one order: workers that fail a job at the same time would
+            // otherwise wait for each other.
+            tx.execute(
+                "UPDATE shards SET worker = worker WHERE job_id = $1 AND state IN ('open', 'running')",
+                values![job.to_string()],
+            )
+            .await?;
+            let held = tx
+                .row(
+                    "SELECT id FROM shards WHERE id = $1 AND epoch = $2 AND state = 'running'",
+                    values![claim.shard.id.to_string(), claim.shard.epoch],
+                )
+                .await?;
+            if held.is_none() {
+                return Ok(false);
+            }
+        }
         // Shards and trainings before the job, as in every other transaction: two of them that lock
         // the same rows in different order would wait for each other. A shard planned in between
         // stays open, but nobody begins a shard of a job that is over.

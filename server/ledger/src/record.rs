@@ -123,6 +123,8 @@ pub struct ShardRecord {
     pub epoch: u64,
     /// Attempts begun.
     pub attempt: u64,
+    /// True if it came from halving a shard that had used up its attempts.
+    pub is_half: bool,
     /// Who has or had it.
     pub worker: Option<String>,
     /// Committed object.
@@ -134,6 +136,13 @@ pub struct ShardRecord {
 }
 
 impl ShardRecord {
+    /// True if it, or the shard that it is a half of, has met a death: its worker takes nothing else
+    /// beside it.
+    #[must_use]
+    pub fn was_tried_before(&self) -> bool {
+        self.attempt > 1 || self.is_half
+    }
+
     pub(crate) fn read(row: &Row) -> Result<Self, LedgerError> {
         Ok(Self {
             id: row.parse("id")?,
@@ -144,6 +153,7 @@ impl ShardRecord {
             state: row.parse("state")?,
             epoch: row.count("epoch")?,
             attempt: row.count("attempt")?,
+            is_half: row.int("is_half")? != 0,
             worker: row.optional_text("worker")?,
             object: row.optional_text("object")?,
             sha256: row.optional_text("sha256")?,

@@ -404,8 +404,7 @@ impl Ledger {
             return Ok(false);
         };
         let shard = ShardRecord::read(&row)?;
-        let is_half = row.int("is_half")? != 0;
-        let outcome = after_loss(shard.attempt, shard.run_count, is_half);
+        let outcome = after_loss(shard.attempt, shard.run_count, shard.is_half);
         let event = EventKind::ShardLost {
             first_run: shard.first_run,
             run_count: shard.run_count,

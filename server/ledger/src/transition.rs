@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! open ── begin (epoch + 1, attempt + 1) ──► running ── commit (same epoch) ──► committed
-//!   ▲                                          │ lost: worker gone, panic, store refused
+//!   ▲                                          │ lost: worker gone, panic, out of limits
 //!   └── attempts left ◄────────────────────────┤
 //!       two open halves, shard `halved` ◄──────┤ attempts used up, several runs
 //!       `dead` with its reason ◄───────────────┘ attempts used up, one run

@@ -288,7 +288,11 @@ async fn feed(
             next += shard.run_count;
         }
         if next == before {
-            if now.is_complete() {
+            // Another coordinator may have had a shard done again since the job was asked.
+            if now.is_complete()
+                && let Some(job) = coordinator.ledger().job(job.id).await?
+                && job.is_complete()
+            {
                 return Err(PublishFailure::Uncovered {
                     kind,
                     found: next,

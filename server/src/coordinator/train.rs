@@ -9,7 +9,7 @@ use anyhow::Context;
 use hydroflex_dataset::Dataset;
 use hydroflex_ledger::blobs::Blobs;
 use hydroflex_ledger::crash::crash_point;
-use hydroflex_ledger::{Ledger, NewModel, TrainingClaim, identity};
+use hydroflex_ledger::{Ledger, LedgerError, NewModel, TrainingClaim, identity};
 use hydroflex_ml::evaluate::{evaluate, with_noise_of_training};
 use hydroflex_ml::model::Model;
 use hydroflex_ml::runs::Runs;
@@ -63,15 +63,42 @@ pub async fn work(config: TrainerConfig, mut stop: watch::Receiver<bool>) -> any
     };
     let blobs = Blobs::open(&config.store)?;
     let machines = Arc::new(Machines::new(config.cache.clone()));
-    let name = identity::worker_name("trainer", 1);
-    ledger.register_worker(&name, None).await?;
-    let heart = tokio::spawn(beat(ledger.clone(), name.clone()));
+    for life in 1.. {
+        let name = identity::worker_name("trainer", life);
+        let ended = live(&ledger, &blobs, &machines, &config.cache, &name, stop.clone()).await;
+        // A claim whose answer was lost is in nobody's hands as long as this name counts as alive.
+        let _ = ledger.give_up_worker(&name, "its trainer stopped").await;
+        match ended {
+            Err(error) if error.is_transient() => {
+                tracing::warn!(trainer = name, %error, "the database is away; trying again");
+            }
+            ended => return ended.context("the database refuses the trainer"),
+        }
+        tokio::select! {
+            _ = stop.wait_for(|stop| *stop) => return Ok(()),
+            () = tokio::time::sleep(BEAT) => {}
+        }
+    }
+    Ok(())
+}
+
+/// Trains under one name, until told to stop or given up.
+async fn live(
+    ledger: &Ledger,
+    blobs: &Blobs,
+    machines: &Arc<Machines>,
+    cache: &Path,
+    name: &str,
+    stop: watch::Receiver<bool>,
+) -> Result<(), LedgerError> {
+    ledger.register_worker(name, None).await?;
+    let mut heart = tokio::spawn(beat(ledger.clone(), name.to_owned()));
     let ended = tokio::select! {
-        ended = serve(&ledger, &blobs, &machines, &config.cache, &name, stop.clone()) => ended,
+        ended = serve(ledger, blobs, machines, cache, name, stop) => ended,
         // Given up: somebody else may have the training. The supervisor starts us anew.
-        _ = heart => Ok(()),
+        _ = &mut heart => Ok(()),
     };
-    let _ = ledger.give_up_worker(&name, "its trainer stopped").await;
+    heart.abort();
     ended
 }
 
@@ -82,10 +109,11 @@ async fn serve(
     cache: &Path,
     name: &str,
     mut stop: watch::Receiver<bool>,
-) -> anyhow::Result<()> {
+) -> Result<(), LedgerError> {
     loop {
-        match ledger.begin_training(name).await {
-            Ok(Some(claim)) => {
+        // After an error nobody knows whether a training was begun: it ends this life.
+        match ledger.begin_training(name).await? {
+            Some(claim) => {
                 crash_point("train-begin");
                 let training = claim.training.id;
                 tracing::info!(%training, attempt = claim.training.attempt, "training begun");
@@ -97,13 +125,7 @@ async fn serve(
                         .await?;
                 }
             }
-            Ok(None) => {}
-            // The claim may have been made and its answer lost: this name is given up, and another one begins.
-            Err(error) if error.is_transient() => {
-                tracing::warn!(%error, "the database is away; starting anew");
-                return Ok(());
-            }
-            Err(error) => return Err(error.into()),
+            None => {}
         }
         tokio::select! {
             _ = stop.wait_for(|stop| *stop) => return Ok(()),
@@ -185,7 +207,6 @@ fn learn(
     cancel: &AtomicBool,
 ) -> Result<Option<CellResult>, TrainError> {
     let dataset = Dataset::open(dataset)?;
-    dataset.verify()?;
     let long = calibration_runs(&dataset, machines, blobs);
     let mut report = |progress: train::Progress| {
         if let Ok(mut latest) = latest.lock() {

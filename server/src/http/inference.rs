@@ -28,8 +28,6 @@ pub const BODY_LIMIT_BYTES: usize = 64 << 20;
 const INLINE_WINDOWS: usize = 512;
 /// Bodies with bytes up to here are read on the spot.
 const INLINE_BODY_BYTES: usize = 1 << 20;
-/// JSON before bytes that is no large part of anybody's work.
-const SMALL_TEXT_BYTES: usize = 1 << 10;
 /// JSON bodies up to here are read on the spot: a millisecond or two.
 const INLINE_TEXT_BYTES: usize = 256 << 10;
 /// Version of a model that is asked for by its content: it has no other.
@@ -402,12 +400,10 @@ async fn estimate(
     // Windows at most, before the body is read: four bytes a value.
     let window_bytes = 4 * named.model.predictor().window_len().max(1);
     let most = 1 + body.len() / window_bytes;
-    // By what the body is, whatever the header says: text takes longer than as many bytes.
-    let (work, most_bytes) = match json_length {
-        Some(length) if length <= body.len() / 2 || length <= SMALL_TEXT_BYTES => {
-            (Work::Bytes, INLINE_BODY_BYTES)
-        }
-        _ => (Work::Text, INLINE_TEXT_BYTES),
+    let (work, most_bytes) = if holds_bytes(body.len(), json_length) {
+        (Work::Bytes, INLINE_BODY_BYTES)
+    } else {
+        (Work::Text, INLINE_TEXT_BYTES)
     };
     let answer = if body.len() <= most_bytes && most <= INLINE_WINDOWS {
         let _ticket = state.gate().inline(work, body.len()).await?;
@@ -446,4 +442,22 @@ async fn estimate(
 fn compute(named: &Named, body: &[u8], json_length: Option<usize>) -> Result<infer::Answer, String> {
     let batch = infer::read(body, json_length, named.model.predictor(), named.model.config())?;
     infer::answer(&named.model, &named.name, &named.version, &batch)
+}
+
+/// Whether tensors follow the JSON: a header's word alone does not make cheap bytes of dear text.
+fn holds_bytes(body_length: usize, json_length: Option<usize>) -> bool {
+    json_length.is_some_and(|json_length| json_length < body_length)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_body_of_nothing_but_json_is_text_whatever_its_header_says() {
+        assert!(holds_bytes(100, Some(40)));
+        for json_length in [None, Some(100), Some(101)] {
+            assert!(!holds_bytes(100, json_length), "{json_length:?}");
+        }
+    }
 }

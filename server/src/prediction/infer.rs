@@ -489,10 +489,24 @@ enum Values<'a> {
     Flags(&'a [bool]),
 }
 
+/// Refuses what is no finite number: JSON would say `null` for it.
+fn check_finite(name: &str, numbers: &[f64], targets: usize) -> Result<(), String> {
+    match numbers.iter().position(|number| !number.is_finite()) {
+        None => Ok(()),
+        Some(place) => Err(format!(
+            "the {name} of target {} of window {} is {}, no finite number: the window is too far from everything \
+             that the model has learned",
+            place % targets,
+            place / targets,
+            numbers[place]
+        )),
+    }
+}
+
 /// Estimates for a checked batch.
 ///
 /// # Errors
-/// If the model gives no finite number.
+/// If an estimate or a bound is no finite number, which JSON cannot hold and nobody can use.
 pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> Result<Answer, String> {
     let predictor = model.predictor();
     let targets = predictor.target_count();
@@ -517,15 +531,6 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
             }
         }
     });
-    // JSON has no such number, and as bytes it would be no better an answer.
-    if let Some(place) = estimates.iter().position(|y| !y.is_finite()) {
-        return Err(format!(
-            "the model gives no finite number for window {} (target {}): its inputs are far outside of what it was \
-             trained on",
-            place / targets,
-            place % targets
-        ));
-    }
     let bound = |sign: f64| -> Vec<f64> {
         estimates
             .iter()
@@ -543,6 +548,13 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
     } else {
         Vec::new()
     };
+    for (name, numbers) in [
+        ("estimate", &estimates),
+        ("lower bound", &lower),
+        ("upper bound", &upper),
+    ] {
+        check_finite(name, numbers, targets)?;
+    }
     let values = |output| match output {
         Output::Estimates => Values::Numbers(&estimates),
         Output::Lower => Values::Numbers(&lower),
@@ -588,4 +600,18 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
         }
     }
     Ok(Answer { body, json_length })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_finite_number_is_named() {
+        assert_eq!(check_finite("estimate", &[1.0, -2.0], 2), Ok(()));
+        for bad in [f64::NAN, f64::INFINITY] {
+            let refused = check_finite("estimate", &[1.0, 2.0, 3.0, bad], 2).unwrap_err();
+            assert!(refused.contains("estimate of target 1 of window 1"), "{refused}");
+        }
+    }
 }

@@ -277,7 +277,7 @@ async fn load(record: &ModelRecord, ledger: &Ledger, blobs: &Blobs) -> Result<Lo
     let provenance = PredictionProvenance {
         model_sha256: record.sha256.clone(),
         dataset_sha256: model.config().provenance.dataset_sha256.clone(),
-        simulator_version: simulator_version(&record.dataset_id, ledger, blobs).await,
+        simulator_version: simulator_version(&record.dataset_id, ledger, blobs).await?,
         trained_by_version: model.config().provenance.hydroflex_version.clone(),
     };
     Ok(LoadedModel {
@@ -290,14 +290,25 @@ async fn load(record: &ModelRecord, ledger: &Ledger, blobs: &Blobs) -> Result<Lo
     })
 }
 
-/// As the data set's manifest says. A model answers without it, so nothing here is an error.
-async fn simulator_version(dataset: &DatasetId, ledger: &Ledger, blobs: &Blobs) -> Option<String> {
-    let dataset = ledger.dataset(dataset).await.ok().flatten()?;
-    let entry = dataset.file(MANIFEST_FILE)?;
-    let content = blobs
-        .read(&dataset.key(MANIFEST_FILE), &entry.sha256)
-        .await
-        .ok()?;
-    let manifest: Manifest = serde_json::from_slice(&content).ok()?;
-    Some(manifest.code.version)
+/// As the data set's manifest says; `None` where there is none, which a model can do without. What the store
+/// cannot say now it may say later, and a model that is kept would be without it for as long.
+async fn simulator_version(
+    dataset: &DatasetId,
+    ledger: &Ledger,
+    blobs: &Blobs,
+) -> Result<Option<String>, ModelUnusable> {
+    let Some(dataset) = ledger.dataset(dataset).await? else {
+        return Ok(None);
+    };
+    let Some(entry) = dataset.file(MANIFEST_FILE) else {
+        return Ok(None);
+    };
+    match blobs.read(&dataset.key(MANIFEST_FILE), &entry.sha256).await {
+        Ok(content) => {
+            let manifest: Option<Manifest> = serde_json::from_slice(&content).ok();
+            Ok(manifest.map(|manifest| manifest.code.version))
+        }
+        Err(error) if error.is_transient() => Err(ModelUnusable::Unavailable(error.to_string())),
+        Err(_) => Ok(None),
+    }
 }

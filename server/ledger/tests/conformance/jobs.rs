@@ -13,6 +13,7 @@ on_every_engine![
     a_job_its_shards_and_its_event_appear_together,
     the_same_key_makes_one_job,
     a_cancelled_job_takes_nothing_more,
+    only_who_holds_a_shard_fails_its_job,
     pages_of_jobs_are_newest_first,
     urgent_jobs_go_first,
     a_job_is_computed_on_one_instruction_set,
@@ -53,6 +54,29 @@ async fn the_same_key_makes_one_job(ledger: Ledger) {
         "{refused:?}"
     );
     assert_eq!(ledger.jobs(None, 10).await.unwrap().len(), 1);
+}
+
+async fn only_who_holds_a_shard_fails_its_job(ledger: Ledger) {
+    let id = ledger.create_job(&new_job(&[4, 4]), None).await.unwrap().id();
+    let slow = ledger.begin_shard("a").await.unwrap().unwrap();
+    ledger
+        .lose_shard(slow.shard.id, slow.shard.epoch, "stopped")
+        .await
+        .unwrap();
+    assert!(!ledger.fail_job_of(&slow, "cannot be planned").await.unwrap());
+    let quick = ledger.begin_shard("b").await.unwrap().unwrap();
+    assert!(!ledger.fail_job_of(&slow, "cannot be planned").await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(job.state, JobState::Simulating);
+    assert!(ledger.holds(&quick).await.unwrap());
+    assert!(ledger.fail_job_of(&quick, "cannot be planned").await.unwrap());
+    let job = ledger.job(id).await.unwrap().unwrap();
+    assert_eq!(
+        (job.state, job.reason.as_deref()),
+        (JobState::Failed, Some("cannot be planned"))
+    );
+    assert!(!ledger.fail_job_of(&quick, "again").await.unwrap());
+    assert!(ledger.begin_shard("a").await.unwrap().is_none());
 }
 
 async fn a_cancelled_job_takes_nothing_more(ledger: Ledger) {
