@@ -203,35 +203,32 @@ impl Worker {
             let asked = Instant::now();
             // After an error nobody knows whether a shard was begun: it ends this life, so that none stays in
             // the hands of a name that beats and knows nothing of it.
-            match self.ledger.begin_shard(name).await? {
-                Some(claim) => {
-                    crash_point("begin");
-                    idle = longest_idle / 4;
-                    // A death is charged to every shard in hand. One that has met a death is alone in hand, so
-                    // that no shard is charged twice for what another does; whoever has free hands may take it.
-                    let alone = claim.shard.was_tried_before();
-                    if alone && delivery.is_under_way() {
-                        self.ledger.release_shard(&claim).await?;
-                        delivery.finish().await?;
-                        continue;
-                    }
-                    let since = match last {
-                        Some((job, at)) if job == claim.job.id => at,
-                        _ => asked,
-                    };
-                    if self.do_shard(&claim, since.elapsed(), delivery).await? {
-                        return Ok(Some(Ended::Spoiled));
-                    }
-                    last = Some((claim.job.id, Instant::now()));
-                    if alone {
-                        delivery.finish().await?;
-                    }
-                }
-                None => {
-                    delivery.finish().await?;
-                    self.pause(idle).await;
-                    idle = (idle * 2).min(longest_idle);
-                }
+            let Some(claim) = self.ledger.begin_shard(name).await? else {
+                delivery.finish().await?;
+                self.pause(idle).await;
+                idle = (idle * 2).min(longest_idle);
+                continue;
+            };
+            crash_point("begin");
+            idle = longest_idle / 4;
+            // A death is charged to every shard in hand. One that has met a death is alone in hand, so
+            // that no shard is charged twice for what another does; whoever has free hands may take it.
+            let alone = claim.shard.was_tried_before();
+            if alone && delivery.is_under_way() {
+                self.ledger.release_shard(&claim).await?;
+                delivery.finish().await?;
+                continue;
+            }
+            let since = match last {
+                Some((job, at)) if job == claim.job.id => at,
+                _ => asked,
+            };
+            if self.do_shard(&claim, since.elapsed(), delivery).await? {
+                return Ok(Some(Ended::Spoiled));
+            }
+            last = Some((claim.job.id, Instant::now()));
+            if alone {
+                delivery.finish().await?;
             }
         }
     }

@@ -112,20 +112,17 @@ async fn serve(
 ) -> Result<(), LedgerError> {
     loop {
         // After an error nobody knows whether a training was begun: it ends this life.
-        match ledger.begin_training(name).await? {
-            Some(claim) => {
-                crash_point("train-begin");
-                let training = claim.training.id;
-                tracing::info!(%training, attempt = claim.training.attempt, "training begun");
-                if let Err(error) = attempt(ledger, blobs, machines, cache, &claim, &stop).await {
-                    let reason = format!("{error:#}");
-                    tracing::warn!(%training, reason, "training attempt lost");
-                    ledger
-                        .lose_training(training, claim.training.epoch, &reason)
-                        .await?;
-                }
+        if let Some(claim) = ledger.begin_training(name).await? {
+            crash_point("train-begin");
+            let training = claim.training.id;
+            tracing::info!(%training, attempt = claim.training.attempt, "training begun");
+            if let Err(error) = attempt(ledger, blobs, machines, cache, &claim, &stop).await {
+                let reason = format!("{error:#}");
+                tracing::warn!(%training, reason, "training attempt lost");
+                ledger
+                    .lose_training(training, claim.training.epoch, &reason)
+                    .await?;
             }
-            None => {}
         }
         tokio::select! {
             _ = stop.wait_for(|stop| *stop) => return Ok(()),
