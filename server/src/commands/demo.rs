@@ -20,6 +20,7 @@ use hydroflex_openapi::catalogue::ModelInfo;
 use hydroflex_openapi::status::{JobState, JobStatus};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
+use sha2::{Digest, Sha256};
 use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -189,8 +190,9 @@ fn chain_of(args: &Args, url: &str) -> anyhow::Result<()> {
         .context("the evaluation has no data set")?
         .to_string();
 
-    fetch(&client, &dataset_id, &args.data.join("dataset"), args.json)?;
-    let evaluation_dir = args.data.join("evaluation-dataset");
+    let dataset_dir = folder_for(&args.data.join("dataset"), &dataset_id)?;
+    fetch(&client, &dataset_id, &dataset_dir, args.json)?;
+    let evaluation_dir = folder_for(&args.data.join("evaluation-dataset"), &evaluation_id)?;
     fetch(&client, &evaluation_id, &evaluation_dir, args.json)?;
     let model_dir = args.data.join("model");
     let info: ModelInfo = client.get(&format!("/v1/models/{model_id}"))?;
@@ -290,6 +292,23 @@ fn say(args: &Args, text: &str) -> anyhow::Result<()> {
     }
 }
 
+/// Where a data set is copied to: `folder`, or, if that holds another one (of an earlier call that asked for other runs, or of
+/// another version), a folder beside it that is named by the id.
+fn folder_for(folder: &Path, dataset_id: &str) -> anyhow::Result<PathBuf> {
+    let path = folder.join("SHA256SUMS");
+    let sums = match std::fs::read(&path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(folder.to_owned()),
+        sums => sums.with_context(|| format!("cannot read {}", path.display()))?,
+    };
+    // An id is how the hash of this file begins.
+    if hex::encode(Sha256::digest(sums)).starts_with(dataset_id) {
+        return Ok(folder.to_owned());
+    }
+    let mut name = folder.as_os_str().to_owned();
+    name.push(format!("-{dataset_id}"));
+    Ok(name.into())
+}
+
 fn training_job(runs: u64) -> serde_json::Value {
     json!({
         "title": "demo", "machine": "lift-boom", "runs": runs, "seed": SEED, "payload_kg": PAYLOAD_KG,
@@ -358,4 +377,22 @@ fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let part = PathBuf::from(name);
     std::fs::write(&part, bytes).with_context(|| format!("cannot write {}", part.display()))?;
     std::fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_data_set_goes_beside_the_one_that_is_there() {
+        let data = tempfile::tempdir().unwrap();
+        let folder = data.path().join("dataset");
+        let id = |sums: &str| hex::encode(Sha256::digest(sums))[..32].to_owned();
+        assert_eq!(folder_for(&folder, &id("one")).unwrap(), folder, "free");
+        std::fs::create_dir(&folder).unwrap();
+        std::fs::write(folder.join("SHA256SUMS"), "one").unwrap();
+        assert_eq!(folder_for(&folder, &id("one")).unwrap(), folder, "the same");
+        let beside = data.path().join(format!("dataset-{}", id("two")));
+        assert_eq!(folder_for(&folder, &id("two")).unwrap(), beside);
+    }
 }
