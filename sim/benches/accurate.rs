@@ -21,11 +21,11 @@ use arrow::array::{Array, AsArray, RecordBatch};
 use arrow::compute::{cast, concat_batches};
 use arrow::datatypes::{DataType, Float64Type};
 use hydroflex_openapi::job::{Integrator, JobSpec};
-use hydroflex_sim::fast::{InstructionSet, PlanarModel, TOLERANCE, Workspace};
+use hydroflex_sim::fast::{InstructionSet, PlanarModel, Workspace};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::trajectory::{RunInput, RunSettings, Trajectory};
+use hydroflex_sim::trajectory::{ACCURATE_TOLERANCE, RunInput, RunSettings, Trajectory};
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -209,7 +209,7 @@ fn measure(simulator: &Simulator, payload_kg: f64, converged: &[Converged]) -> C
     };
     let mut ws = Workspace::default();
     let runs: Vec<Trajectory> = model
-        .run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws)
+        .run_batch(&inputs, SAMPLE_S, ACCURATE_TOLERANCE, &mut ws)
         .into_iter()
         .map(|run| run.expect("the run ends"))
         .collect();
@@ -217,7 +217,7 @@ fn measure(simulator: &Simulator, payload_kg: f64, converged: &[Converged]) -> C
         |count: &dyn Fn(&Trajectory) -> u64| runs.iter().map(count).sum::<u64>() as f64 / runs.len() as f64;
     let alone = best_us(inputs.len(), || {
         for input in &inputs {
-            let run = model.run(input, SAMPLE_S, TOLERANCE, &mut Workspace::default());
+            let run = model.run(input, SAMPLE_S, ACCURATE_TOLERANCE, &mut Workspace::default());
             std::hint::black_box(&run);
         }
     });
@@ -225,7 +225,7 @@ fn measure(simulator: &Simulator, payload_kg: f64, converged: &[Converged]) -> C
         .into_iter()
         .map(|set| {
             let us = best_us(inputs.len(), || {
-                let runs = model.run_batch_on(set, &inputs, SAMPLE_S, TOLERANCE, &mut ws);
+                let runs = model.run_batch_on(set, &inputs, SAMPLE_S, ACCURATE_TOLERANCE, &mut ws);
                 std::hint::black_box(&runs);
             });
             (set, us)
@@ -328,11 +328,11 @@ fn main() {
         let model = PlanarModel::new(simulator.machine().file(), body, true).expect("the machine is planar");
         let mut ws = Workspace::default();
         let batch = best_us(inputs.len(), || {
-            std::hint::black_box(&model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
+            std::hint::black_box(&model.run_batch(&inputs, SAMPLE_S, ACCURATE_TOLERANCE, &mut ws));
         });
         let alone = best_us(inputs.len(), || {
             for input in &inputs {
-                let run = model.run(input, SAMPLE_S, TOLERANCE, &mut Workspace::default());
+                let run = model.run(input, SAMPLE_S, ACCURATE_TOLERANCE, &mut Workspace::default());
                 std::hint::black_box(&run);
             }
         });

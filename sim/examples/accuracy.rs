@@ -14,22 +14,22 @@
 )]
 
 use hydroflex_openapi::job::{Integrator, JobSpec};
-use hydroflex_sim::fast::{PlanarModel, TOLERANCE, Workspace};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::scenario::plan_run;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::trajectory::{RunInput, RunSettings, Trajectory};
+use hydroflex_sim::trajectory::{RunFailure, RunInput, RunSettings, Trajectory};
+use rayon::prelude::*;
 use serde_json::json;
 
 const SAMPLE_S: f64 = 0.005;
-/// Tolerance of what counts as converged.
+/// Tolerance of what counts as converged, if none is given.
 const CONVERGED: f64 = 1e-6;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let mut positional = Vec::new();
     let mut meshes = Vec::new();
-    let (mut second, mut worst) = (None, 3);
+    let (mut second, mut worst, mut tight) = (None, 3, CONVERGED);
     let mut next = |name: &str| arguments.next().ok_or(format!("{name} is missing"));
     while let Ok(argument) = next("") {
         match argument.as_str() {
@@ -37,6 +37,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "--second" => {
                 second = Some((next("--second RUNS")?.parse()?, next("--second STEP_S")?.parse()?));
             }
+            "--converged" => tight = next("--converged TOLERANCE")?.parse()?,
             "--worst" => worst = next("--worst N")?.parse()?,
             _ => positional.push(argument),
         }
@@ -54,22 +55,28 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let inputs: Vec<RunInput> = (0..spec.runs)
             .map(|index| plan_run(&spec, simulator.machine().file(), &simulator, index))
             .collect::<Result<_, _>>()?;
-        let body = &simulator.reduced(payload_kg > 0.0)?[0];
-        let model = PlanarModel::new(simulator.machine().file(), body, payload_kg > 0.0)?;
-        let mut ws = Workspace::default();
-        let ours = finished(model.run_batch(&inputs, SAMPLE_S, TOLERANCE, &mut ws));
-        let converged = finished(model.run_batch(&inputs, SAMPLE_S, CONVERGED, &mut ws));
+        simulator.prepare(payload_kg > 0.0)?;
+        let settings = RunSettings {
+            integrator: Integrator::Accurate,
+            sample_time_s: SAMPLE_S,
+        };
+        let each = |run: &(dyn Fn(&RunInput) -> Result<Trajectory, RunFailure> + Sync)| {
+            finished(inputs.par_iter().map(run).collect())
+        };
+        let ours = each(&|input| simulator.run(input, &settings));
+        let converged = each(&|input| simulator.run_to(input, SAMPLE_S, tight));
         let count = ours.len().max(1) as f64;
         let mean =
             |of: &dyn Fn(&Trajectory) -> u64| ours.iter().flatten().map(of).sum::<u64>() as f64 / count;
         println!(
-            "{machine}, {payload_kg} kg, {} runs with seed {seed}: {:.0} steps, {:.1} rejected, {:.0} factorisations a run",
+            "{machine}, {payload_kg} kg, {} runs with seed {seed}, {:?} path: {:.0} steps, {:.1} rejected, {:.0} factorisations a run",
             inputs.len(),
+            simulator.solver_path(Integrator::Accurate, payload_kg > 0.0)?,
             mean(&|run| run.statistics.steps),
             mean(&|run| run.statistics.rejected),
             mean(&|run| run.statistics.factorisations),
         );
-        println!("  against tolerance {CONVERGED:e}:");
+        println!("  against tolerance {tight:e}:");
         let scales = report(&simulator, &inputs, &ours, &converged, worst, None);
         if let Some((few, step_s)) = second {
             let few: usize = few;
@@ -79,7 +86,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             };
             let few = few.min(inputs.len());
             let other: Vec<_> = inputs[..few]
-                .iter()
+                .par_iter()
                 .map(|input| simulator.run(input, &settings).ok())
                 .collect();
             println!("  against the general path's trapezoidal rule with {step_s} s:");
@@ -91,7 +98,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 worst,
                 Some(&scales),
             );
-            println!("  and that of tolerance {CONVERGED:e} against it:");
+            println!("  and that of tolerance {tight:e} against it:");
             report(
                 &simulator,
                 &inputs[..few],

@@ -6,7 +6,7 @@ use hydroflex_openapi::job::RunFlag;
 use crate::integrate::{Newton, Scheme, Stepper};
 use crate::system::{State, System};
 use crate::trajectory::recorder::{FlagSet, Recorder};
-use crate::trajectory::{RunFailure, Trajectory};
+use crate::trajectory::{ACCURATE_TOLERANCE, RunFailure, Trajectory};
 
 /// Spectral radius of the scheme behind accurate runs: it damps what no step resolves, and keeps
 /// the joints closed.
@@ -18,6 +18,10 @@ const STEP_SHORTEST_S: f64 = 1e-5;
 /// Steps into which every step of the first sample is cut where the start is not at rest: what is left of the static
 /// solution settles faster than anything that follows, and would alone decide the step of the whole run.
 const FIRST_SAMPLE_PARTS: u32 = 16;
+/// Shortest piece of a sample between kinks, as part of it: closer to a sample's end a kink is taken as being there.
+const PIECE_LEAST: f64 = 1e-3;
+/// Part of a step by which the steps of a piece may be longer than asked for, before there is one more of them.
+const STEP_STRETCH: f64 = 0.25;
 /// Largest change of a channel between the last two step sizes, relative to the channel's range, at which the two are extrapolated.
 /// Halving the step of a second-order scheme leaves a third of that change as error; the extrapolation takes most
 /// of it away (nine tenths on the published crane, two thirds are needed for 1e-3).
@@ -39,9 +43,12 @@ pub(crate) struct GeneralRun<'a> {
 /// Where steps end within a sample.
 #[derive(Debug, Clone, Copy)]
 struct Grid {
-    steps_per_sample: u32,
-    /// The same in the first sample.
-    steps_first: u32,
+    /// Steps of the coarsest grid.
+    coarse_per_sample: u32,
+    /// Parts of every such step.
+    parts: u32,
+    /// Parts of every one of these in the first sample.
+    parts_first: u32,
     /// Also where a valve signal crosses zero: there the metering edge changes, and a step across
     /// that kink would lose the scheme's order.
     split_at_zero: bool,
@@ -51,8 +58,9 @@ impl GeneralRun<'_> {
     /// A fixed number of equal steps per sample.
     pub(crate) fn fixed(&self, scheme: Scheme, steps_per_sample: u32) -> Result<Trajectory, RunFailure> {
         let grid = Grid {
-            steps_per_sample,
-            steps_first: steps_per_sample,
+            coarse_per_sample: steps_per_sample,
+            parts: 1,
+            parts_first: 1,
             split_at_zero: false,
         };
         self.march(scheme, Newton::EXACT, grid)
@@ -62,7 +70,14 @@ impl GeneralRun<'_> {
     /// (Richardson): `x = x_f + (x_f − x_c)/3` for a scheme of second order.
     ///
     /// Where a chamber empties or a cylinder reaches its end the order is lost, and only the finer run counts.
-    pub(crate) fn accurate(&self, channels: &[Channel]) -> Result<Trajectory, RunFailure> {
+    /// `tolerance` bounds the error of every channel but accelerations, over its range ([`ACCURATE_TOLERANCE`] by default).
+    pub(crate) fn accurate(&self, channels: &[Channel], tolerance: f64) -> Result<Trajectory, RunFailure> {
+        let tighter = tolerance / ACCURATE_TOLERANCE;
+        let newton = if tighter < 1.0 {
+            Newton::EXACT
+        } else {
+            Newton::FRUGAL
+        };
         let scheme = Scheme::generalized_alpha(SPECTRAL_RADIUS);
         let resolutions: Vec<f64> = channels.iter().map(resolution).collect();
         #[expect(
@@ -70,23 +85,25 @@ impl GeneralRun<'_> {
             clippy::cast_sign_loss,
             reason = "small and positive"
         )]
-        let mut steps = (self.sample_time_s / STEP_LONGEST_S).ceil().clamp(1.0, 1e6) as u32;
+        let coarsest = (self.sample_time_s / STEP_LONGEST_S).ceil().clamp(1.0, 1e6) as u32;
         let first_parts = match self.system.conventions.statics {
             Some(_) => FIRST_SAMPLE_PARTS,
             None => 1,
         };
-        let march = |steps_per_sample| {
+        let march = |parts| {
             let grid = Grid {
-                steps_per_sample,
-                steps_first: steps_per_sample * first_parts,
+                coarse_per_sample: coarsest,
+                parts,
+                parts_first: first_parts,
                 split_at_zero: true,
             };
-            self.march(scheme, Newton::FRUGAL, grid)
+            self.march(scheme, newton, grid)
         };
-        let mut coarse = march(steps)?;
+        let mut parts = 1;
+        let mut coarse = march(parts)?;
         loop {
-            steps *= 2;
-            let mut fine = march(steps)?;
+            parts *= 2;
+            let mut fine = march(parts)?;
             fine.statistics.steps += coarse.statistics.steps;
             fine.statistics.rejected += coarse.statistics.rejected;
             fine.statistics.iterations += coarse.statistics.iterations;
@@ -96,11 +113,13 @@ impl GeneralRun<'_> {
                 let kinks = [RunFlag::Cavitation, RunFlag::EndStop, RunFlag::StrokeCutoff];
                 run.flags.iter().any(|flag| kinks.contains(flag))
             };
-            if change <= CHANGE_EXTRAPOLATED_MOST && !switches(&coarse) && !switches(&fine) {
+            if change <= tighter * CHANGE_EXTRAPOLATED_MOST && !switches(&coarse) && !switches(&fine) {
                 extrapolate(&coarse, &mut fine);
                 return Ok(fine);
             }
-            if change <= CHANGE_MOST || self.sample_time_s / f64::from(steps) < STEP_SHORTEST_S {
+            if change <= tighter * CHANGE_MOST
+                || self.sample_time_s / f64::from(coarsest * parts) < STEP_SHORTEST_S
+            {
                 return Ok(fine);
             }
             coarse = fine;
@@ -122,7 +141,9 @@ impl GeneralRun<'_> {
         let mut columns = self.recorder.new_columns(samples + 1);
         let mut flags = FlagSet::default();
         let (mut from, mut to) = (vec![0.0; cylinders.len()], vec![0.0; cylinders.len()]);
-        let mut ends = Vec::with_capacity(2 * grid.steps_first as usize + 2 * cylinders.len() + 2);
+        let steps = (grid.coarse_per_sample as usize + cylinders.len() + 1)
+            * (grid.parts * grid.parts_first) as usize;
+        let mut ends = Vec::with_capacity(steps + cylinders.len() + 2);
         let mut stepper = Stepper::with_newton(self.system, scheme, newton, self.start.clone())?;
         let record = |stepper: &Stepper<'_>, sample, columns: &mut Vec<Vec<f64>>| {
             let valves = |k| self.valve(k, sample);
@@ -169,14 +190,12 @@ impl GeneralRun<'_> {
     /// Ends of the steps of a sample, as parts of it: ascending, the last one is 1.
     fn step_ends(&self, grid: Grid, sample: usize, ends: &mut Vec<f64>) {
         ends.clear();
-        let steps = if sample == 1 {
-            grid.steps_first
+        let halvings = if sample == 1 {
+            grid.parts * grid.parts_first
         } else {
-            grid.steps_per_sample
+            grid.parts
         };
-        let total = f64::from(steps);
-        ends.extend((1..steps).map(|k| f64::from(k) / total));
-        ends.push(1.0);
+        // Kinks first …
         if grid.split_at_zero {
             for k in 0..self.valves_ratio.len() {
                 let (before, after) = (self.valve(k, sample - 1), self.valve(k, sample));
@@ -185,17 +204,36 @@ impl GeneralRun<'_> {
                 }
             }
             ends.sort_unstable_by(f64::total_cmp);
-            // A sliver of a step would only cost; the kink is then close enough to a step's end.
-            let least = 1e-3 / total;
             let mut last = 0.0;
             ends.retain(|&end| {
-                let keep = end >= 1.0 || (end - last > least && 1.0 - end > least);
+                let keep = end - last > PIECE_LEAST && 1.0 - end > PIECE_LEAST;
                 if keep {
                     last = end;
                 }
                 keep
             });
         }
+        ends.push(1.0);
+        // … then equal steps between them: every step of a finer grid is half a step of the coarser one, without
+        // which the error would not fall to a quarter and could not be extrapolated.
+        let pieces = ends.len();
+        let mut begin = 0.0;
+        for piece in 0..pieces {
+            let end = ends[piece];
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "between 1 and the steps of a sample"
+            )]
+            let coarse = ((end - begin) * f64::from(grid.coarse_per_sample) - STEP_STRETCH)
+                .ceil()
+                .max(1.0) as u32;
+            let steps = coarse * halvings;
+            let at = |k: u32| begin + (end - begin) * f64::from(k) / f64::from(steps);
+            ends.extend((1..steps).map(at));
+            begin = end;
+        }
+        ends.sort_unstable_by(f64::total_cmp);
     }
 }
 

@@ -10,7 +10,7 @@ use crate::integrate::Scheme;
 use crate::system::System;
 use crate::testing::rig;
 use crate::trajectory::recorder::Recorder;
-use crate::trajectory::{Trajectory, channels};
+use crate::trajectory::{ACCURATE_TOLERANCE, Trajectory, channels};
 
 struct Bench {
     file: MachineFile,
@@ -188,7 +188,9 @@ fn accurate_runs_agree_with_short_steps() {
         .map(|k| if k % 17 < 6 { -0.7 } else { libm::sin(f64::from(k)) })
         .collect();
     let listed = channels(&bench.file);
-    let accurate = bench.run(valve.clone(), 0.005, |r| r.accurate(&listed).unwrap());
+    let accurate = bench.run(valve.clone(), 0.005, |r| {
+        r.accurate(&listed, ACCURATE_TOLERANCE).unwrap()
+    });
     let fine = bench.run(valve, 0.005, |r| {
         r.fixed(Scheme::generalized_alpha(0.7), 400).unwrap()
     });

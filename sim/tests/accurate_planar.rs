@@ -9,10 +9,10 @@
 )]
 
 use hydroflex_openapi::job::{Integrator, RunFlag};
-use hydroflex_sim::fast::{InstructionSet, PlanarModel, TOLERANCE, Workspace};
+use hydroflex_sim::fast::{InstructionSet, PlanarModel, Workspace};
 use hydroflex_sim::machine::Machine;
 use hydroflex_sim::simulator::Simulator;
-use hydroflex_sim::trajectory::{RunInput, RunSettings, Trajectory};
+use hydroflex_sim::trajectory::{ACCURATE_TOLERANCE, RunInput, RunSettings, Trajectory};
 
 const SAMPLE_S: f64 = 0.005;
 
@@ -98,7 +98,7 @@ fn neighbours_and_registers_change_no_bit() {
             .rev()
             .cloned()
             .collect();
-        for tolerance in [TOLERANCE, 1e-4, 1e-6] {
+        for tolerance in [ACCURATE_TOLERANCE, 1e-4, 1e-6] {
             let mut ws = Workspace::default();
             let alone: Vec<_> = some
                 .iter()
@@ -130,11 +130,11 @@ fn payloads_side_by_side_change_no_bit() {
     let mut ws = Workspace::default();
     let alone: Vec<_> = inputs
         .iter()
-        .map(|input| bits(&model.run(input, SAMPLE_S, TOLERANCE, &mut ws).unwrap()))
+        .map(|input| bits(&model.run(input, SAMPLE_S, ACCURATE_TOLERANCE, &mut ws).unwrap()))
         .collect();
     for set in InstructionSet::available() {
         for inputs in [&inputs[..], &inputs[3..]] {
-            let results = model.run_batch_on(set, inputs, SAMPLE_S, TOLERANCE, &mut ws);
+            let results = model.run_batch_on(set, inputs, SAMPLE_S, ACCURATE_TOLERANCE, &mut ws);
             for (input, result) in inputs.iter().zip(results) {
                 let alone = &alone[usize::try_from(input.run_id).unwrap()];
                 assert_eq!(*alone, bits(&result.unwrap()), "{set:?}, run {}", input.run_id);
@@ -160,7 +160,7 @@ fn both_paths_agree_at_small_steps() {
         let body = &simulator.reduced(payload_kg > 0.0).unwrap()[0];
         let model = PlanarModel::new(simulator.machine().file(), body, payload_kg > 0.0).unwrap();
         let theirs = simulator.run(&input, &general).unwrap();
-        for tolerance in [TOLERANCE, 1e-4] {
+        for tolerance in [ACCURATE_TOLERANCE, 1e-4] {
             let ours = model
                 .run(&input, SAMPLE_S, tolerance, &mut Workspace::default())
                 .unwrap();

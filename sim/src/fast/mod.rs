@@ -38,12 +38,11 @@ pub use model::{MOST_MODES, NotPlanar, PlanarModel};
 
 use crate::equilibrium::EquilibriumError;
 use crate::simulator::SimulatorError;
+#[cfg(doc)]
+use crate::trajectory::ACCURATE_TOLERANCE;
 use crate::trajectory::{InputError, RunFailure, RunInput, Trajectory};
 use lockstep::{Common, RunResult};
 use model::Modes;
-
-/// Default accuracy: every channel but accelerations within 1e-3 of its range.
-pub const TOLERANCE: f64 = 1e-3;
 
 /// Scratch memory; may be dirty, and keeps the modes of the last payload.
 #[derive(Debug, Clone, Default)]
@@ -53,7 +52,7 @@ pub struct Workspace {
 
 impl PlanarModel {
     /// Simulates one run. `tolerance` bounds the error of every channel but accelerations, over
-    /// its usual range; [`TOLERANCE`] is the default, 1e-4 the other proven value.
+    /// its usual range; [`ACCURATE_TOLERANCE`] is the default, 1e-4 the other proven value.
     ///
     /// # Errors
     /// [`RunFailure`] if the run cannot be finished.

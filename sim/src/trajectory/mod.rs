@@ -10,6 +10,9 @@ pub use channels::channels;
 pub use failure::{InputError, RunFailure};
 pub use recorder::von_mises_pa;
 
+/// What `accurate` promises: every channel but accelerations within this of its range.
+pub const ACCURATE_TOLERANCE: f64 = 1e-3;
+
 /// One run as asked for: the configuration, and the valve signal of every cylinder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunInput {

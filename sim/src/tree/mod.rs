@@ -16,7 +16,6 @@ mod statics;
 mod run;
 
 pub use model::{NotTree, TreeModel};
-pub use run::TOLERANCE;
 
 #[cfg(test)]
 mod tests;

@@ -8,10 +8,8 @@ use super::model::TreeModel;
 use super::step::{Point, Signal, Stepper};
 use crate::system::{State, Workspace};
 use crate::trajectory::recorder::FlagSet;
-use crate::trajectory::{RunFailure, RunInput, SolverStatistics, Trajectory};
+use crate::trajectory::{ACCURATE_TOLERANCE, RunFailure, RunInput, SolverStatistics, Trajectory};
 
-/// Default accuracy: every channel but accelerations within 1e-3 of its range.
-pub const TOLERANCE: f64 = 1e-3;
 /// Local error over typical ranges that keeps this promise: on the published crane with the modes in the plane it leaves
 /// 3.5e-4 of range (three times this number still 5e-4).
 const LOCAL_TOLERANCE: f64 = 1e-4;
@@ -63,7 +61,7 @@ impl TreeModel {
         let mut stepper = Stepper::new(self);
         let state = self.rest(file, &input.angles_rad, &mut stepper.motion)?;
         let samples = input.valves_ratio.first().map_or(0, Vec::len);
-        let local = LOCAL_TOLERANCE * tolerance / TOLERANCE;
+        let local = LOCAL_TOLERANCE * tolerance / ACCURATE_TOLERANCE;
         let mut run = Run {
             model: self,
             input,

@@ -4,9 +4,9 @@ use hydroflex_openapi::job::{RunFlag, SolverPath};
 use hydroflex_openapi::machine::MachineFile;
 use nalgebra::Vector3;
 
+use super::NotTree;
 use super::model::TreeModel;
 use super::motion::Motion;
-use super::{NotTree, TOLERANCE};
 use crate::body::rotation::euler_parameters_about_z;
 use crate::equilibrium::equilibrium;
 use crate::general::GeneralRun;
@@ -15,7 +15,7 @@ use crate::reduction::ReducedBody;
 use crate::system::{Level, Oil, State, System};
 use crate::testing::{Numbers, closed_crane, rig};
 use crate::trajectory::recorder::Recorder;
-use crate::trajectory::{RunInput, Trajectory, channels};
+use crate::trajectory::{ACCURATE_TOLERANCE, RunInput, Trajectory, channels};
 
 fn random_motion(model: &TreeModel, seed: u64) -> [Vec<f64>; 3] {
     let mut x = Numbers::new(seed);
@@ -176,7 +176,7 @@ fn differences(
     let model = TreeModel::new(file, reduced, with_payload)
         .unwrap()
         .with_payload_mass(input.payload_kg);
-    let found = model.run(file, input, 0.005, TOLERANCE).unwrap();
+    let found = model.run(file, input, 0.005, ACCURATE_TOLERANCE).unwrap();
     let system = System::new(file, reduced, input.payload_kg).unwrap();
     let recorder = Recorder::new(file, reduced, &system);
     let start = equilibrium(&system, file, &input.angles_rad, &mut system.new_workspace()).unwrap();
@@ -247,7 +247,7 @@ fn a_closed_crane_with_its_valves_shut_stays_where_it_is() {
         angles_rad: vec![0.3, 0.1],
         valves_ratio: vec![vec![0.0; 200]; 2],
     };
-    let run = model.run(&file, &input, 0.005, TOLERANCE).unwrap();
+    let run = model.run(&file, &input, 0.005, ACCURATE_TOLERANCE).unwrap();
     for (channel, column) in channels(&file).iter().zip(&run.columns) {
         if channel.name.starts_with("length") || channel.name.starts_with("angle") {
             let drift = column.iter().fold(0.0_f64, |m, x| m.max((x - column[0]).abs()));
