@@ -69,6 +69,11 @@ pub fn training_data(
             train,
             validation,
             calibration: calibrating,
+            payloads_kg: dataset
+                .runs()
+                .iter()
+                .map(|run| (run.run_id, run.payload_kg))
+                .collect(),
             dataset_sha256,
         },
         spec,

@@ -35,6 +35,7 @@ pub mod structure;
 pub mod least_squares;
 mod cholesky;
 pub mod scheduled;
+pub mod payload;
 pub mod envelope;
 pub mod noise;
 mod simd;

@@ -33,13 +33,33 @@ use hydroflex_openapi::model::Schedule;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Largest total degree in the lengths.
-const MAX_DEGREE: u32 = 4;
-/// Most unknowns per target; their cube is the time of the fit.
-const MAX_UNKNOWNS: usize = 2600;
+/// How much a fit may take.
+#[derive(Debug, Clone)]
+pub struct Effort {
+    /// Largest total degree in the slow signals.
+    pub degree: u32,
+    /// Most unknowns per target; their cube is the time of the fit.
+    pub unknowns: usize,
+    /// Ridges tried, relative to the mean square of a scaled channel: powers of ten.
+    pub ridges: std::ops::RangeInclusive<i32>,
+    /// The smallest ridges that the normal equations can be solved with are tried, so many and one after the other; absent:
+    /// all, at once, each with its own copy of the normal matrix.
+    pub tried: Option<usize>,
+}
+
+impl Effort {
+    /// Of a map whose coefficients follow the lengths.
+    pub const LENGTHS: Self = Self {
+        degree: 4,
+        unknowns: 2600,
+        ridges: -15..=-3,
+        tried: None,
+    };
+}
+
 /// Fewest samples of the window that the products see when unknowns have to be saved.
 const FEWEST_PRODUCT_STEPS: usize = 12;
-/// Most multiply-adds spent on the normal matrix; beyond, windows are left out evenly.
+/// Most multiply-adds spent on a normal matrix; beyond, windows are left out evenly.
 const MAX_PRODUCTS: f64 = 6e11;
 /// Windows gathered at once.
 const BLOCK: usize = 512;
@@ -48,9 +68,7 @@ const BLOCK: usize = 512;
 pub const RANGE_FACTOR: f64 = 1.3;
 /// Part of the validation windows that choose degree and ridge. In the others something rare may
 /// happen (an end stop, cavitation) that no such map follows, and whose errors would decide instead.
-const JUDGED_PART: f64 = 0.9;
-/// Ridges tried, relative to the mean square of a scaled channel: powers of ten.
-const RIDGES: std::ops::RangeInclusive<i32> = -15..=-3;
+pub(crate) const JUDGED_PART: f64 = 0.9;
 
 /// Fitted map.
 #[derive(Debug, Clone, PartialEq)]
@@ -81,6 +99,10 @@ pub struct Sample<'a> {
     pub windows: &'a Windows,
     /// Scaled targets.
     pub targets: &'a TargetRows,
+    /// Indices of the windows that take part; absent: all.
+    pub only: Option<&'a [usize]>,
+    /// A slow signal more, in units of its range, by the index of the window; absent: none.
+    pub estimates: Option<&'a [f64]>,
 }
 
 /// Position of the first value of an input in a window that the products use, and the exponents.
@@ -106,17 +128,19 @@ impl ScheduledMap {
         scaling: &Scaling,
         scheduling: &[usize],
         noise: Option<&Mat<f64>>,
+        effort: &Effort,
     ) -> Result<Self, NormalEquationsError> {
         let schedule = ranges(train.series, scaling, scheduling);
         let steps = train.windows.steps;
-        let terms = terms(scheduling.len(), steps, train.series.width);
+        let signals = scheduling.len() + usize::from(train.estimates.is_some());
+        let terms = terms(signals, steps, train.series.width, effort);
         let exponents: Vec<Vec<u32>> = terms.iter().map(|t| t.exponents.clone()).collect();
         let schedule = Schedule {
             exponents,
             ..schedule
         };
         let normal = Normal::gather(&train, scaling, &schedule, &terms, noise);
-        let candidates = normal.candidates();
+        let candidates = normal.candidates(effort);
         let errors = normal.errors(&candidates, &judge, scaling, &schedule);
         let best = errors
             .iter()
@@ -128,17 +152,19 @@ impl ScheduledMap {
         Ok(normal.map(best, &schedule))
     }
 
-    /// Scaled targets of a scaled window.
+    /// Scaled targets of a scaled window. `estimate`: the slow signal more of [`Sample::estimates`].
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn apply(&self, scaling: &Scaling, window: &[f32], out: &mut [f64]) {
+    pub fn apply(&self, scaling: &Scaling, window: &[f32], estimate: Option<f64>, out: &mut [f64]) {
         let size = window.len();
         let last = &window[size - scaling.len()..];
         out.fill(0.0);
-        let factors = factors(&self.schedule, |input| {
-            scaling.unscale(input, f64::from(last[input]))
-        });
+        let factors = factors(
+            &self.schedule,
+            |input| scaling.unscale(input, f64::from(last[input])),
+            estimate,
+        );
         for (term, factor) in factors.iter().enumerate() {
             for (t, slot) in out.iter_mut().enumerate() {
                 let row = term * self.targets + t;
@@ -155,8 +181,8 @@ impl ScheduledMap {
 
 /// m_t(u) of every term, from the slow signals in their units.
 #[must_use]
-pub fn factors(schedule: &Schedule, value: impl Fn(usize) -> f64) -> Vec<f64> {
-    let u = normalised(schedule, value);
+pub fn factors(schedule: &Schedule, value: impl Fn(usize) -> f64, estimate: Option<f64>) -> Vec<f64> {
+    let u = normalised(schedule, value, estimate);
     schedule
         .exponents
         .iter()
@@ -164,12 +190,14 @@ pub fn factors(schedule: &Schedule, value: impl Fn(usize) -> f64) -> Vec<f64> {
         .collect()
 }
 
-fn normalised(schedule: &Schedule, value: impl Fn(usize) -> f64) -> Vec<f64> {
+fn normalised(schedule: &Schedule, value: impl Fn(usize) -> f64, estimate: Option<f64>) -> Vec<f64> {
     schedule
         .inputs
         .iter()
         .zip(schedule.centre.iter().zip(&schedule.half_range))
-        .map(|(&input, (centre, half))| ((value(input) - centre) / half).clamp(-1.0, 1.0))
+        .map(|(&input, (centre, half))| (value(input) - centre) / half)
+        .chain(estimate)
+        .map(|u| u.clamp(-1.0, 1.0))
         .collect()
 }
 
@@ -219,17 +247,17 @@ fn of_degree(channels: usize, degree: u32) -> Vec<Vec<u32>> {
         .collect()
 }
 
-/// Terms by ascending degree; the largest degree that [`MAX_UNKNOWNS`] allow, products over the
+/// Terms by ascending degree; the largest degree that `effort` allows, products over the
 /// latest samples only where the whole window would be too many.
-fn terms(scheduling: usize, steps: usize, width: usize) -> Vec<Term> {
+fn terms(scheduling: usize, steps: usize, width: usize, effort: &Effort) -> Vec<Term> {
     let size = steps * width;
-    for degree in (0..=MAX_DEGREE).rev() {
+    for degree in (0..=effort.degree).rev() {
         let exponents: Vec<Vec<u32>> = (0..=degree).flat_map(|d| of_degree(scheduling, d)).collect();
         let products = exponents.len() - 1;
         if degree > 0 && products == 0 {
             continue;
         }
-        let room = MAX_UNKNOWNS.saturating_sub(size + 1);
+        let room = effort.unknowns.saturating_sub(size + 1);
         let product_steps = room
             .checked_div(products)
             .map_or(steps, |share| (share.saturating_sub(1) / width).min(steps));
@@ -296,7 +324,7 @@ impl<'a> Normal<'a> {
                 sums.entry(sum).or_insert_with(|| Mat::zeros(size + 1, size + 1));
             }
         }
-        let chosen = thinned(train.windows.len(), size, sums.len());
+        let chosen = thinned(train, size, sums.len());
         let mean = mean_window(train, &chosen);
         let targets = train.targets.width;
         let mut right: Vec<Mat<f64>> = terms.iter().map(|_| Mat::zeros(size + 1, targets)).collect();
@@ -360,19 +388,18 @@ impl<'a> Normal<'a> {
     }
 
     /// Solutions for every ridge and degree.
-    fn candidates(&self) -> Vec<Candidate> {
-        let exponents: Vec<i32> = RIDGES.collect();
-        exponents
-            .par_iter()
-            .filter_map(|&exponent| {
-                let ridge = 10.0_f64.powi(exponent);
-                let factor = self.factor(ridge)?;
-                Some(self.solve(&factor, ridge))
-            })
-            .collect::<Vec<_>>()
-            .into_iter()
-            .flatten()
-            .collect()
+    fn candidates(&self, effort: &Effort) -> Vec<Candidate> {
+        let of_ridge = |exponent: i32| {
+            let ridge = 10.0_f64.powi(exponent);
+            let factor = self.factor(ridge)?;
+            Some(self.solve(&factor, ridge))
+        };
+        let exponents: Vec<i32> = effort.ridges.clone().collect();
+        let found: Vec<Vec<Candidate>> = match effort.tried {
+            None => exponents.par_iter().filter_map(|&e| of_ridge(e)).collect(),
+            Some(tried) => exponents.into_iter().filter_map(of_ridge).take(tried).collect(),
+        };
+        found.into_iter().flatten().collect()
     }
 
     /// Cholesky factor with ridge; absent where rounding made the matrix indefinite.
@@ -421,7 +448,7 @@ impl<'a> Normal<'a> {
         scaling: &Scaling,
         schedule: &Schedule,
     ) -> Vec<f64> {
-        let all = thinned(judge.windows.len(), self.size, candidates.len());
+        let all = thinned(judge, self.size, candidates.len());
         let targets = judge.targets.width;
         let mut errors = vec![vec![Vec::with_capacity(all.len()); targets]; candidates.len()];
         for block in all.chunks(BLOCK) {
@@ -499,7 +526,8 @@ fn add(a: &[u32], b: &[u32]) -> Vec<u32> {
 }
 
 /// Windows that take part: all, or evenly spread ones where all would take too long.
-fn thinned(windows: usize, size: usize, products: usize) -> Vec<usize> {
+fn thinned(sample: &Sample<'_>, size: usize, products: usize) -> Vec<usize> {
+    let windows = sample.only.map_or(sample.windows.len(), <[usize]>::len);
     let work = windows as f64 * (size * size) as f64 * products as f64 / 2.0;
     #[allow(
         clippy::cast_possible_truncation,
@@ -507,7 +535,11 @@ fn thinned(windows: usize, size: usize, products: usize) -> Vec<usize> {
         reason = "at least 1, and small"
     )]
     let stride = (work / MAX_PRODUCTS).ceil().max(1.0) as usize;
-    (0..windows).step_by(stride).collect()
+    let evenly = (0..windows).step_by(stride);
+    match sample.only {
+        Some(only) => evenly.map(|place| only[place]).collect(),
+        None => evenly.collect(),
+    }
 }
 
 fn mean_window(sample: &Sample<'_>, chosen: &[usize]) -> Vec<f64> {
@@ -565,9 +597,11 @@ impl Gathered {
                 targets[(column, t)] = y;
             }
             let last = sample.series.row(row);
-            u.push(normalised(schedule, |input| {
-                scaling.unscale(input, f64::from(last[input]))
-            }));
+            u.push(normalised(
+                schedule,
+                |input| scaling.unscale(input, f64::from(last[input])),
+                sample.estimates.map(|estimates| estimates[index]),
+            ));
         }
         Self { windows, u, targets }
     }
@@ -684,6 +718,8 @@ mod tests {
             series: &case.series,
             windows: &case.windows,
             targets: &case.targets,
+            only: None,
+            estimates: None,
         }
     }
 
@@ -692,7 +728,7 @@ mod tests {
         (0..case.windows.len())
             .map(|index| {
                 let window = case.series.window(case.windows.first_row(index), STEPS);
-                map.apply(&case.scaling, window, &mut estimate);
+                map.apply(&case.scaling, window, None, &mut estimate);
                 (estimate[0] - case.targets.row(case.windows.last_row(index))[0]).abs()
             })
             .fold(0.0, f64::max)
@@ -706,7 +742,8 @@ mod tests {
         };
         let train = case(1, law);
         let fit = |scheduling: &[usize]| {
-            ScheduledMap::fit(sample(&train), sample(&train), &train.scaling, scheduling, None).unwrap()
+            let sample = sample(&train);
+            ScheduledMap::fit(sample, sample, &train.scaling, scheduling, None, &Effort::LENGTHS).unwrap()
         };
         let map = fit(&[0]);
         assert!(map.schedule.exponents.len() >= 3, "{:?}", map.schedule.exponents);
@@ -724,11 +761,11 @@ mod tests {
     #[test]
     fn terms_are_ordered_by_degree_and_stay_within_their_number() {
         for (scheduling, steps, width) in [(1, 60, 5), (1, 100, 5), (2, 100, 10), (0, 100, 5), (2, 20, 2)] {
-            let terms = terms(scheduling, steps, width);
+            let terms = terms(scheduling, steps, width, &Effort::LENGTHS);
             let degrees: Vec<u32> = terms.iter().map(|t| t.exponents.iter().sum()).collect();
             assert!(degrees.is_sorted(), "{degrees:?}");
             let last = terms.last().unwrap();
-            assert!(last.offset + steps * width - last.first < MAX_UNKNOWNS);
+            assert!(last.offset + steps * width - last.first < Effort::LENGTHS.unknowns);
             assert_eq!(terms[0].first, 0, "the linear part sees the whole window");
             assert_eq!(scheduling == 0, terms.len() == 1);
         }

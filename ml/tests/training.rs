@@ -67,6 +67,7 @@ fn data() -> TrainingData {
         train: oscillators(16, 0),
         validation: oscillators(4, 100),
         calibration: vec![oscillators(4, 100)],
+        payloads_kg: std::collections::HashMap::new(),
         dataset_sha256: "0".repeat(64),
     }
 }
@@ -276,6 +277,7 @@ fn stuck_and_swapped_sensors_are_flagged_and_honest_runs_are_not() {
         train: oscillators(64, 0),
         validation: oscillators(8, 100),
         calibration: vec![oscillators(64, 200)],
+        payloads_kg: std::collections::HashMap::new(),
         dataset_sha256: "0".repeat(64),
     };
     train(

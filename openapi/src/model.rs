@@ -38,6 +38,10 @@ pub struct ModelConfig {
     /// Slow signals that the coefficients of the linear map follow; absent when they are constant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<Schedule>,
+    /// The payload that the coefficients of the linear map follow beside the slow signals, where training runs had different ones;
+    /// absent: they do not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub payload: Option<FollowedPayload>,
     /// Smallest and largest value of each input, in its column's unit, at which it is held before it enters
     /// the model: far outside its training data a polynomial says nothing, and says it loudly. Absent: not held.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -105,6 +109,41 @@ pub struct Schedule {
     pub half_range: Vec<f64>,
     /// One row per term: the exponent of each signal.
     pub exponents: Vec<Vec<u32>>,
+}
+
+/// A payload that nobody tells the model: estimated from the window, each estimate better than the one before, because its
+/// coefficients follow that one.
+///
+/// ```text
+/// e_k = Σ_t m_t · (W_t window + b_t)        (tensors `payload.k.weight`, `payload.k.bias`, in f64)
+/// ```
+///
+/// with the schedule `estimates[k]`. `e` is the payload in units of its range, `(payload − centre_kg) / half_range_kg`. The schedules
+/// of the later estimates and of the skip have an exponent more per term than slow signals, the last one: that of
+/// `clamp(e_(k−1), −1, 1)`. Where there is `empty` and the last estimate is below its limit, the linear map `empty.*` takes the
+/// place of the skip.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct FollowedPayload {
+    /// Middle of the range, kg.
+    pub centre_kg: f64,
+    /// Half of it, kg; beyond it the coefficients stay what they are at its edge.
+    pub half_range_kg: f64,
+    /// Of each estimate, first to last.
+    pub estimates: Vec<Schedule>,
+    /// The machine without payload, which is another one: nothing hangs on its interface.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub empty: Option<EmptyMachine>,
+}
+
+/// The linear map (`empty.*`) of a machine without payload.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EmptyMachine {
+    /// A machine whose estimated payload is below this counts as empty, kg.
+    pub below_kg: f64,
+    /// Of its linear map.
+    pub schedule: Schedule,
 }
 
 /// Bounds of the estimates, one value per target, in its column's unit:
@@ -361,6 +400,23 @@ pub struct EvaluationReport {
     /// Part of the windows inside the model's envelope, where it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub inside_envelope: Option<f64>,
+    /// What the envelope flags, by whether the windows stay within the cylinder lengths of the training runs; where the model has
+    /// an envelope and sees lengths.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flagged_by_length: Option<FlaggedByLength>,
+}
+
+/// Flagged windows within and beyond the cylinder lengths of the training runs: of honest runs, those within are false alarms.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FlaggedByLength {
+    /// Part of the windows with a sample in which a cylinder is shorter or longer than in any training run.
+    pub beyond: f64,
+    /// Part of the other windows that are flagged; absent where there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flagged_within: Option<f64>,
+    /// Part of the windows beyond that are flagged; absent where there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flagged_beyond: Option<f64>,
 }
 
 /// Errors of a simple estimator.

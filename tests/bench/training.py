@@ -67,15 +67,19 @@ def tensors(data, config, windows):
     return torch.tensor(windows.reshape(len(ends), -1).copy()), torch.tensor(y[ends, None].astype(np.float32))
 
 
+def dense(config):
+    modules = []
+    for layer in config["layers"]:
+        modules += [torch.nn.Linear(layer["inputs"], layer["outputs"]), *(ACTIVATIONS[name]() for name in layer["activations"])]
+    return torch.nn.Sequential(*modules)
+
+
 def theirs(x, y, config, windows, epochs, threads, seed):
     """Seconds and seconds of processor time per epoch, and the mean loss of each epoch."""
     batch = CASES[windows][0]
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    modules = []
-    for layer in config["layers"]:
-        modules += [torch.nn.Linear(layer["inputs"], layer["outputs"]), *(ACTIVATIONS[name]() for name in layer["activations"])]
-    net = torch.nn.Sequential(*modules)
+    net = config if isinstance(config, torch.nn.Module) else dense(config)
     adam = torch.optim.Adam(net.parameters(), lr=1e-3, eps=1e-8, fused=True)
     # As ours: a constant rate with the published windows, a cosine with all.
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, epochs * -(-len(x) // batch)) if windows == "overlapping" else None
@@ -113,6 +117,63 @@ def round_of(data, scratch, x, y, structure, windows, threads, seed):
     return a, b
 
 
+class Recurrent(torch.nn.Module):
+    """RNN or LSTM over the samples of a window, width 64; the last output decides. As `hydroflex` has them."""
+
+    def __init__(self, kind, channels, width=64):
+        super().__init__()
+        self.channels, self.cell = channels, getattr(torch.nn, kind)(channels, width, batch_first=True)
+        self.last = torch.nn.Linear(width, 1)
+
+    def forward(self, x):
+        return self.last(self.cell(x.reshape(len(x), -1, self.channels))[0][:, -1])
+
+
+class Convolutional(torch.nn.Module):
+    """Two convolutions of 5 samples and stride 2 with 32 and 64 channels, ReLU, and a linear layer."""
+
+    def __init__(self, channels, width=64):
+        super().__init__()
+        self.channels = channels
+        options = {"kernel_size": 5, "stride": 2, "padding": 2}
+        left = -(-(-(-WINDOW_STEPS // 2)) // 2)
+        self.net = torch.nn.Sequential(
+            torch.nn.Conv1d(channels, width // 2, **options), torch.nn.ReLU(), torch.nn.Conv1d(width // 2, width, **options), torch.nn.ReLU(),
+            torch.nn.Flatten(), torch.nn.Linear(width * left, 1))
+
+    def forward(self, x):
+        return self.net(x.reshape(len(x), -1, self.channels).transpose(1, 2))
+
+
+def comparison(scratch, structure, rounds, threads):
+    """A line on a network for comparison: hydroflex trains these in its study only, on all windows, and judges them after."""
+    few, many = 1, 3
+
+    def one(epochs):
+        out = scratch / "study"
+        cell = out / "0kg" / f"all-{structure}-0.json"
+        cell.unlink(missing_ok=True)
+        subprocess.run(
+            [HYDROFLEX, "reproduce-paper", "--machine", "lift-boom", "--payloads", "0", "--sensors", "all", "--targets", TARGET,
+             "--structures", structure, "--seeds", "1", "--epochs", str(epochs), "--out", out, "--json"],
+            check=True, capture_output=True, env={**os.environ, "RAYON_NUM_THREADS": str(threads)})
+        return json.loads(cell.read_text())[0]["train_seconds"], out / "0kg" / "training"
+
+    times, count = [], 0
+    for seed in range(rounds):
+        (short_s, data), (long_s, _) = one(few), one(many)
+        table = pq.read_table(next((data / "data").glob("train-*.parquet")))
+        names = [n for n in table.column_names if n.split("_")[0] in ("valve", "length", "velocity", "pressure")]
+        scale = [{"name": n, "offset": table[n].to_numpy().mean(), "scale": table[n].to_numpy().std() or 1.0} for n in [*names, TARGET]]
+        x, y = tensors(data, {"inputs": scale[:-1], "targets": scale[-1:]}, "overlapping")
+        count = len(x)
+        net = Convolutional(len(names)) if structure == "CNN" else Recurrent(structure, len(names))
+        times.append(((long_s - short_s) / (many - few), theirs(x, y, net, "overlapping", 2, threads, seed)[0]))
+    ratios = [b / a for a, b in times]
+    return (f"| {count:,} overlapping | {CASES['overlapping'][0]} | {structure} | {threads} | {ms([b for _, b in times])} | {ms([a for a, _ in times])} "
+            f"| **{statistics.median(ratios):.2f}** ({min(ratios):.2f}, {max(ratios):.2f}) | | | |")
+
+
 def ms(values):
     return f"{statistics.median(values) * 1e3:.1f}"
 
@@ -134,6 +195,7 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--structures", nargs="*", default=["L", "RLR", "ELE", "TLTLT", "TLSLTLSLT"])
     parser.add_argument("--overlapping", nargs="*", default=["RLR"], help="structures that are also trained on all windows")
+    parser.add_argument("--comparisons", nargs="*", default=["RNN", "LSTM", "CNN"], help="networks for comparison, on one thread")
     parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--data", type=pathlib.Path, help="the data set, if it is at hand")
@@ -161,6 +223,9 @@ def main():
                     curves[structure] = pairs
                     losses.append(f"| {structure} | {spread([late(b) for _, b in pairs])} | {spread([late(a) for a, _ in pairs])} |")
                     print(losses[-1], flush=True)
+        for structure in arguments.comparisons:
+            speeds.append(comparison(scratch, structure, arguments.rounds, arguments.threads[0]))
+            print(speeds[-1], flush=True)
     if arguments.out:
         report(pathlib.Path(arguments.out), arguments.rounds, speeds, losses, curves)
 

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,14 +32,44 @@ class Slide(torch.nn.Module):
             modules.append(torch.nn.Linear(layer["inputs"], layer["outputs"]))
             modules += [ACTIVATIONS[name]() for name in layer["activations"]]
         self.net = torch.nn.Sequential(*modules)
+        size, targets = config["window_steps"] * len(config["inputs"]), len(config["targets"])
+
+        def linear(schedule, targets):
+            return torch.nn.Linear(size, (len(schedule["exponents"]) if schedule else 1) * targets, dtype=torch.float64)
+
         if config["linear_skip"]:
-            terms = len(config["schedule"]["exponents"]) if config.get("schedule") else 1
-            size = config["window_steps"] * len(config["inputs"])
-            self.skip = torch.nn.Linear(size, terms * len(config["targets"]), dtype=torch.float64)
+            self.skip = linear(config.get("schedule"), targets)
+        if payload := config.get("payload"):
+            self.payload = torch.nn.ModuleList(linear(schedule, 1) for schedule in payload["estimates"])
+            if payload.get("empty"):
+                self.empty = linear(payload["empty"]["schedule"], targets)
         if config.get("guard"):
             size = config["window_steps"] * len(config["inputs"])
             self.guard = torch.nn.Linear(size, len(config["targets"]))
         self.config = config
+
+    def scheduled(self, linear, schedule, x, raw_last, estimate):
+        """A linear map whose coefficients follow slow signals, and an estimate of the payload."""
+        if not schedule:
+            return linear(x)
+        terms = linear(x).reshape(len(x), len(schedule["exponents"]), -1)
+        columns = zip(schedule["inputs"], schedule["centre"], schedule["half_range"])
+        u = [((raw_last[:, i] - c) / h).clamp(-1, 1) for i, c, h in columns] + ([] if estimate is None else [estimate.clamp(-1, 1)])
+        factors = torch.ones(terms.shape[:2], dtype=torch.float64)
+        for place, exponents in enumerate(schedule["exponents"]):
+            for signal, exponent in zip(u, exponents):
+                factors[:, place] *= signal**exponent
+        return (terms * factors[:, :, None]).sum(1)
+
+    def linear_part(self, x, raw_last):
+        payload, estimate = self.config.get("payload"), None
+        for linear, schedule in zip(self.payload, payload["estimates"]) if payload else ():
+            estimate = self.scheduled(linear, schedule, x, raw_last, estimate)[:, 0]
+        y = self.scheduled(self.skip, self.config.get("schedule"), x, raw_last, estimate)
+        if payload and (empty := payload.get("empty")):
+            below = (empty["below_kg"] - payload["centre_kg"]) / payload["half_range_kg"]
+            y = torch.where((estimate < below)[:, None], self.scheduled(self.empty, empty["schedule"], x, raw_last, None), y)
+        return y
 
     def forward(self, x, raw_last):
         """Scaled windows and the sensors at their ends to estimates in physical units."""
@@ -47,15 +78,7 @@ class Slide(torch.nn.Module):
         x = x.float().double()
         y = self.net(x.float()).double()
         if config["linear_skip"]:
-            terms = self.skip(x).reshape(len(x), -1, len(config["targets"]))
-            factors = torch.ones(len(x), terms.shape[1], dtype=torch.float64)
-            if schedule := config.get("schedule"):
-                columns = zip(schedule["inputs"], schedule["centre"], schedule["half_range"])
-                u = torch.stack([((raw_last[:, i] - c) / h).clamp(-1, 1) for i, c, h in columns], 1)
-                for place, exponents in enumerate(schedule["exponents"]):
-                    for column, exponent in enumerate(exponents):
-                        factors[:, place] *= u[:, column] ** exponent
-            y = y + (terms * factors[:, :, None]).sum(1)
+            y = y + self.linear_part(x, raw_last)
         if guard := config.get("guard"):
             offset, scale = column_of(config["targets"], "offset"), column_of(config["targets"], "scale")
             guide, slack = self.guard(x.float()).double(), torch.tensor(guard["slack"]) / scale
@@ -68,19 +91,19 @@ def column_of(channels, key):
     return torch.tensor([channel[key] for channel in channels], dtype=torch.float64)
 
 
-def make(folder):
+def make(folder, name="set", runs=24, payload_kg=lambda run: 50.0):
     rng = np.random.default_rng(5)
-    steps, runs = 200, 24
+    steps = 200
     signals = [np.clip(np.cumsum(rng.normal(0, 0.15, steps)), -1, 1) for _ in range(runs)]
     table = pa.table({
         "run_id": pa.array(range(runs), pa.uint64()),
-        "payload_kg": [50.0] * runs,
-        "angle_lift_rad": [math.radians(1.5 * run) for run in range(runs)],
+        "payload_kg": [float(payload_kg(run)) for run in range(runs)],
+        "angle_lift_rad": [math.radians(36 * run / runs) for run in range(runs)],
         "valve_lift_ratio": pa.array(signals, pa.list_(pa.float64())),
     })
     pq.write_table(table, folder / "runs.parquet")
-    subprocess.run([HYDROFLEX, "simulate", "--runs", folder / "runs.parquet", "--out", folder / "set"], check=True, capture_output=True)
-    return folder / "set"
+    subprocess.run([HYDROFLEX, "simulate", "--runs", folder / "runs.parquet", "--out", folder / name], check=True, capture_output=True)
+    return folder / name
 
 
 class Windows(torch.utils.data.Dataset):
@@ -130,6 +153,7 @@ def check_model(folder, data, structure):
         difference = np.max(np.abs(ours - found[:, place])) / spread
         print(f"{structure:10} {target['name']:20} {difference:.1e} of range", flush=True)
         assert difference < 1e-5, difference
+    return config
 
 
 def check_loader(data):
@@ -152,6 +176,11 @@ def main():
         check_loader(data)
         for structure in STRUCTURES:
             check_model(folder, data, structure)
+        # Payloads that the network has to find out, a third of the runs without any.
+        mixed = make(folder, "mixed", 300, lambda run: 0 if run % 3 == 0 else 7.3 * run % 100)
+        shutil.rmtree(folder / "model-best")
+        config = check_model(folder, mixed, "best")
+        assert config["payload"]["empty"], "the payload is followed"
     print("passed")
 
 

@@ -2,12 +2,18 @@
 estimates are held at their bounds."""
 
 import json
+import math
+import os
+import pathlib
+import subprocess
 import sys
 import tempfile
 import urllib.request
 
 import numpy
 import onnxruntime
+import pyarrow
+import pyarrow.parquet
 
 import test_triton
 
@@ -16,6 +22,8 @@ NEAR, FAR = 1e-5, 1e-3
 
 
 def main():
+    with tempfile.TemporaryDirectory() as folder:
+        unknown_payload(pathlib.Path(folder))
     with tempfile.TemporaryDirectory() as folder:
         service = test_triton.Service(folder)
         try:
@@ -30,6 +38,32 @@ def main():
         finally:
             service.kill()
     print("onnxruntime: all as it should be")
+
+
+def unknown_payload(folder):
+    """A network that estimates the payload from the window, and has a map of its own without any: golden windows of all runs."""
+    rng = numpy.random.default_rng(5)
+    runs, steps = 400, 100
+    signals = [numpy.clip(numpy.cumsum(rng.normal(0, 0.15, steps)), -1, 1) for _ in range(runs)]
+    table = pyarrow.table({
+        "run_id": pyarrow.array(range(runs), pyarrow.uint64()),
+        "payload_kg": [0.0 if run % 3 == 0 else 100.0 * rng.random() for run in range(runs)],
+        "angle_lift_rad": [math.radians(rng.uniform(0, 30)) for _ in range(runs)],
+        "valve_lift_ratio": pyarrow.array(signals, pyarrow.list_(pyarrow.float64())),
+    })
+    pyarrow.parquet.write_table(table, folder / "runs.parquet")
+    binary = os.environ.get("HYDROFLEX_BIN", "target/release/hydroflex")
+    for arguments in (["simulate", "--machine", "lift-boom", "--runs", folder / "runs.parquet", "--out", folder / "set"],
+                      ["train", "--data", folder / "set", "--out", folder / "model", "--epochs", "3", "--window-s", "0.2"]):
+        subprocess.run([binary, *arguments], check=True, capture_output=True)
+    config = json.loads((folder / "model" / "config.json").read_text())
+    assert config["payload"]["empty"] and len(config["payload"]["estimates"]) == 4, "the payload is followed"
+    session = onnxruntime.InferenceSession(folder / "model" / "model.onnx", providers=["CPUExecutionProvider"])
+    windows = numpy.array([golden["window"] for golden in config["golden"]]).reshape(-1, config["window_steps"], len(config["inputs"]))
+    ours = numpy.array([golden["estimates"] for golden in config["golden"]])
+    scale = numpy.array([channel["scale"] for channel in config["targets"]])
+    theirs = session.run(["estimates"], {"window": windows})[0]
+    assert (numpy.abs(ours - theirs) / scale).max() <= NEAR, "an unknown payload"
 
 
 def check(service, model):

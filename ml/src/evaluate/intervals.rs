@@ -1,15 +1,18 @@
 //! 90 % intervals by split conformal prediction (Vovk et al.), in classes of amplitude.
 //!
-//! Within a class the half width is the ⌈0.9 (n + 1)⌉-th smallest absolute error of the validation
-//! windows. Errors grow with the estimate's distance from the mean, so a single width would cover
+//! Within a class the half width is the ⌈0.9 (n + 1)⌉-th smallest absolute error of the windows that
+//! calibrate. Errors grow with the estimate's distance from the mean, so a single width would cover
 //! small amplitudes too often and large ones too rarely.
 
 use hydroflex_openapi::model::IntervalTable;
 
 /// Part of the true values inside, in tenths.
 const LEVEL_TENTHS: usize = 9;
-/// Classes of amplitude, of equal numbers of validation windows.
-const CLASSES: usize = 3;
+/// Classes of amplitude, of equal numbers of windows: at least three, and more where the windows fill them, because errors
+/// also differ within a third …
+const CLASSES: std::ops::RangeInclusive<usize> = 3..=12;
+/// … which needs this many windows in each; neighbouring windows tell nearly the same.
+const FILLED_CLASS: usize = 2000;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
 
@@ -21,7 +24,9 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
         .zip(reference)
         .map(|(e, r)| ((e - centre).abs(), (e - r).abs()))
         .collect();
-    let classes = CLASSES.min(pairs.len() / SMALLEST_CLASS);
+    let classes = (pairs.len() / FILLED_CLASS)
+        .clamp(*CLASSES.start(), *CLASSES.end())
+        .min(pairs.len() / SMALLEST_CLASS);
     if classes == 0 {
         return None;
     }

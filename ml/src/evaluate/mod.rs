@@ -4,6 +4,7 @@ pub mod metrics;
 pub mod intervals;
 pub mod table;
 pub mod faults;
+pub mod lengths;
 pub mod profile;
 
 use crate::model::Model;
@@ -14,6 +15,7 @@ use crate::scaling::Scaling;
 use crate::window::WindowError;
 use hydroflex_openapi::job::NoiseSpec;
 use hydroflex_openapi::model::{BaselineMetrics, EvaluationReport, TargetMetrics};
+use lengths::{Counts, TrainedLengths};
 use metrics::metrics;
 
 /// Stream of the noise of evaluations; trainings use others.
@@ -108,6 +110,8 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
     );
     let mut all = Columns::new(count);
     let (mut inside, mut windows) = (0_usize, 0_usize);
+    let lengths = TrainedLengths::of(config);
+    let mut counts = Counts::default();
     let mut evaluated = Vec::new();
     for (input, target) in inputs.runs.iter().zip(&targets.runs) {
         if input.len() < config.window_steps {
@@ -127,6 +131,9 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
         let quasi_static = linear_series(&model.auxiliary().quasi_static, &scaling, &columns, 1, first);
         inside += series.inside.iter().filter(|&&i| i).count();
         windows += reference[0].len();
+        if let Some(lengths) = &lengths {
+            counts.add(lengths, &columns, config.window_steps, &series.inside);
+        }
         for t in 0..count {
             all.reference[t].extend_from_slice(&reference[t]);
             all.estimate[t].extend_from_slice(&series.columns[t]);
@@ -192,6 +199,7 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
             },
         ],
         inside_envelope: predictor.has_envelope().then(|| inside as f64 / windows as f64),
+        flagged_by_length: lengths.map(|_| counts.parts()),
     };
     Ok(Evaluation {
         report,

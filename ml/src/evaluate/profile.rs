@@ -224,6 +224,7 @@ mod tests {
                 targets: Vec::new(),
                 baselines: Vec::new(),
                 inside_envelope: None,
+                flagged_by_length: None,
             },
             runs: vec![RunEvaluation {
                 run_id: 0,

@@ -16,7 +16,7 @@ pub mod card;
 pub mod onnx;
 
 use crate::predict::Predictor;
-use hydroflex_openapi::model::{MODEL_FORMAT_VERSION, ModelConfig};
+use hydroflex_openapi::model::{MODEL_FORMAT_VERSION, ModelConfig, Schedule};
 use sha2::{Digest, Sha256};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -263,7 +263,26 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
     if config.layers.is_empty() && !config.linear_skip {
         return Err(inconsistent("a model needs layers or a linear map"));
     }
-    if let Some(schedule) = &config.schedule {
+    // Each schedule, and whether it follows an estimate of the payload.
+    let mut schedules: Vec<(&Schedule, bool)> = Vec::new();
+    schedules.extend(config.schedule.iter().map(|s| (s, config.payload.is_some())));
+    if let Some(payload) = &config.payload {
+        if config.schedule.is_none() || payload.estimates.is_empty() {
+            return Err(inconsistent(
+                "a followed payload needs an estimate and a linear map with a schedule",
+            ));
+        }
+        if !(payload.centre_kg.is_finite()
+            && payload.half_range_kg.is_finite()
+            && payload.half_range_kg > 0.0
+            && payload.empty.as_ref().is_none_or(|e| e.below_kg.is_finite()))
+        {
+            return Err(inconsistent("the followed payload's range is none"));
+        }
+        schedules.extend(payload.estimates.iter().enumerate().map(|(k, s)| (s, k > 0)));
+        schedules.extend(payload.empty.iter().map(|empty| (&empty.schedule, false)));
+    }
+    for (schedule, follows) in schedules {
         let signals = schedule.inputs.len();
         if !config.linear_skip || schedule.exponents.is_empty() {
             return Err(inconsistent(
@@ -272,7 +291,7 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
         }
         if schedule.centre.len() != signals
             || schedule.half_range.len() != signals
-            || schedule.exponents.iter().any(|e| e.len() != signals)
+            || (schedule.exponents.iter()).any(|e| e.len() != signals + usize::from(follows))
             || schedule.inputs.iter().any(|&i| i >= config.inputs.len())
             || schedule.half_range.iter().any(|h| !(h.is_finite() && *h > 0.0))
         {

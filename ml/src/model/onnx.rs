@@ -166,7 +166,7 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
         x = graph.columns("last_step", &x, (steps - 1) * targets, targets);
     }
     if let Some(skip) = &weights.skip {
-        let linear = graph.skip(config, skip, &rounded, window_values);
+        let linear = graph.skip(config, weights, skip, &rounded, window_values);
         x = if config.layers.is_empty() {
             linear
         } else {
@@ -230,6 +230,17 @@ struct Graph {
     initializers: Vec<TensorProto>,
 }
 
+/// A linear map whose coefficients follow slow signals.
+#[derive(Clone, Copy)]
+struct Terms<'a> {
+    name: &'a str,
+    map: &'a SkipWeights,
+    schedule: Option<&'a Schedule>,
+    /// The estimate that they follow too, within ±1.
+    estimate: Option<&'a str>,
+    targets: usize,
+}
+
 impl Graph {
     fn node(&mut self, op_type: &str, inputs: &[&str], attribute: Vec<AttributeProto>) -> String {
         let output = format!("v{}", self.nodes.len());
@@ -253,7 +264,11 @@ impl Graph {
         output
     }
 
+    /// A constant is made once; another one has another name.
     fn constant(&mut self, name: &str, data_type: i32, dims: &[usize], raw_data: Vec<u8>) -> String {
+        if self.initializers.iter().any(|tensor| tensor.name == name) {
+            return name.to_owned();
+        }
         let dims = dims.iter().map(|&d| to_i64(d)).collect();
         self.initializers.push(TensorProto {
             dims,
@@ -325,22 +340,80 @@ impl Graph {
         self.node("Gather", &[x, &indices], vec![integer("axis", 1)])
     }
 
+    /// The linear map in f64, with the payload that it follows.
+    fn skip(
+        &mut self,
+        config: &ModelConfig,
+        weights: &Weights,
+        map: &SkipWeights,
+        flat: &str,
+        window_values: usize,
+    ) -> String {
+        let targets = config.targets.len();
+        let terms = |graph: &mut Self, name: &str, map, schedule, estimate: Option<&str>, targets| {
+            let terms = Terms {
+                name,
+                map,
+                schedule,
+                estimate,
+                targets,
+            };
+            graph.terms(config, &terms, flat, window_values)
+        };
+        let Some(payload) = &config.payload else {
+            return terms(self, "skip", map, config.schedule.as_ref(), None, targets);
+        };
+        let mut estimate: Option<String> = None;
+        let mut followed: Option<String> = None;
+        for (k, (schedule, map)) in payload.estimates.iter().zip(&weights.payload).enumerate() {
+            let name = format!("payload.{k}");
+            let next = terms(self, &name, map, Some(schedule), followed.as_deref(), 1);
+            followed = Some(self.within_one(&next));
+            estimate = Some(next);
+        }
+        let loaded = terms(
+            self,
+            "skip",
+            map,
+            config.schedule.as_ref(),
+            followed.as_deref(),
+            targets,
+        );
+        match (&payload.empty, &weights.empty, estimate) {
+            (Some(empty), Some(map), Some(estimate)) => {
+                let empty_map = terms(self, "empty", map, Some(&empty.schedule), None, targets);
+                let below = (empty.below_kg - payload.centre_kg) / payload.half_range_kg;
+                let below = self.doubles("empty_below", std::iter::once(below));
+                let is_empty = self.node("Less", &[&estimate, &below], Vec::new());
+                self.node("Where", &[&is_empty, &empty_map, &loaded], Vec::new())
+            }
+            _ => loaded,
+        }
+    }
+
     /// `Σ_t m_t (W_t x + b_t)` in f64.
-    fn skip(&mut self, config: &ModelConfig, map: &SkipWeights, flat: &str, window_values: usize) -> String {
+    fn terms(&mut self, config: &ModelConfig, terms: &Terms<'_>, flat: &str, window_values: usize) -> String {
+        let Terms {
+            name,
+            map,
+            schedule,
+            estimate,
+            targets,
+        } = *terms;
         let outputs = map.bias.len();
         let raw = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
         let dims = [outputs, map.weight.len() / outputs.max(1)];
-        let weight = self.constant("skip.weight", DOUBLE, &dims, raw(&map.weight));
-        let bias = self.constant("skip.bias", DOUBLE, &[outputs], raw(&map.bias));
+        let weight = self.constant(&format!("{name}.weight"), DOUBLE, &dims, raw(&map.weight));
+        let bias = self.constant(&format!("{name}.bias"), DOUBLE, &[outputs], raw(&map.bias));
         let all = self.node("Gemm", &[flat, &weight, &bias], vec![integer("transB", 1)]);
-        let Some(schedule) = &config.schedule else {
+        let Some(schedule) = schedule else {
             return all;
         };
-        let slow = self.slow_signals(config, schedule, flat, window_values);
-        let targets = config.targets.len();
+        let mut slow = self.slow_signals(config, name, schedule, flat, window_values);
+        slow.extend(estimate.map(str::to_owned));
         let mut sum: Option<String> = None;
         for (term, exponents) in schedule.exponents.iter().enumerate() {
-            let mut part = self.columns(&format!("term_{term}"), &all, term * targets, targets);
+            let mut part = self.columns(&format!("{name}.term_{term}"), &all, term * targets, targets);
             for (signal, &exponent) in slow.iter().zip(exponents) {
                 for _ in 0..exponent {
                     part = self.node("Mul", &[&part, signal], Vec::new());
@@ -358,12 +431,11 @@ impl Graph {
     fn slow_signals(
         &mut self,
         config: &ModelConfig,
+        name: &str,
         schedule: &Schedule,
         flat: &str,
         window_values: usize,
     ) -> Vec<String> {
-        let minus_one = self.doubles("minus_one", std::iter::once(-1.0));
-        let one = self.doubles("one", std::iter::once(1.0));
         schedule
             .inputs
             .iter()
@@ -371,18 +443,25 @@ impl Graph {
             .map(|(&input, (centre, half_range))| {
                 let channel = &config.inputs[input];
                 let last = window_values - config.inputs.len() + input;
-                let scaled = self.columns(&format!("slow_{input}"), flat, last, 1);
+                let scaled = self.columns(&format!("{name}.slow_{input}"), flat, last, 1);
                 // (scale · scaled + offset − centre) / half_range
                 let gain = channel.scale / half_range;
                 let shift = (channel.offset - centre) / half_range;
-                let gain = self.doubles(&format!("slow_{input}_gain"), std::iter::once(gain));
-                let shift = self.doubles(&format!("slow_{input}_shift"), std::iter::once(shift));
+                let gain = self.doubles(&format!("{name}.slow_{input}_gain"), std::iter::once(gain));
+                let shift = self.doubles(&format!("{name}.slow_{input}_shift"), std::iter::once(shift));
                 let grown = self.node("Mul", &[&scaled, &gain], Vec::new());
                 let moved = self.node("Add", &[&grown, &shift], Vec::new());
-                let above = self.node("Max", &[&moved, &minus_one], Vec::new());
-                self.node("Min", &[&above, &one], Vec::new())
+                self.within_one(&moved)
             })
             .collect()
+    }
+
+    /// `clamp(x, −1, 1)`, f64.
+    fn within_one(&mut self, x: &str) -> String {
+        let minus_one = self.doubles("minus_one", std::iter::once(-1.0));
+        let one = self.doubles("one", std::iter::once(1.0));
+        let above = self.node("Max", &[x, &minus_one], Vec::new());
+        self.node("Min", &[&above, &one], Vec::new())
     }
 
     /// Scaled estimates within the guard's bounds.

@@ -4,7 +4,7 @@ use super::ModelError;
 use crate::least_squares::LinearMap;
 use crate::scheduled::ScheduledMap;
 use crate::train::checkpoint::{from_bytes, to_bytes};
-use hydroflex_openapi::model::{DenseLayer, ModelConfig};
+use hydroflex_openapi::model::{DenseLayer, ModelConfig, Schedule};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
 use std::path::Path;
 
@@ -53,6 +53,10 @@ pub struct Weights {
     /// Of the skip, where there is one. f64: its large coefficients act on small differences of
     /// neighbouring samples.
     pub skip: Option<SkipWeights>,
+    /// Of the estimates of the payload, first to last.
+    pub payload: Vec<SkipWeights>,
+    /// Of the linear map of a machine without payload.
+    pub empty: Option<SkipWeights>,
     /// The guide of the estimates, where the configuration has bounds.
     pub guard: Option<LinearWeights>,
 }
@@ -102,11 +106,11 @@ fn linear(prefix: &str, map: &LinearWeights) -> [Tensor; 2] {
     )
 }
 
-fn skip_tensors(map: &SkipWeights) -> [Tensor; 2] {
+fn skip_tensors(prefix: &str, map: &SkipWeights) -> [Tensor; 2] {
     let outputs = map.bias.len();
     let bytes = [&map.weight, &map.bias].map(|values| values.iter().flat_map(|v| v.to_le_bytes()).collect());
     pair(
-        "skip",
+        prefix,
         Dtype::F64,
         outputs,
         map.weight.len() / outputs.max(1),
@@ -188,7 +192,13 @@ impl Weights {
             .flat_map(|(layer, map)| linear(&layer.name, map))
             .collect();
         if let Some(skip) = &self.skip {
-            tensors.extend(skip_tensors(skip));
+            tensors.extend(skip_tensors("skip", skip));
+        }
+        for (k, map) in self.payload.iter().enumerate() {
+            tensors.extend(skip_tensors(&format!("payload.{k}"), map));
+        }
+        if let Some(empty) = &self.empty {
+            tensors.extend(skip_tensors("empty", empty));
         }
         if let Some(guard) = &self.guard {
             tensors.extend(linear("guard", guard));
@@ -209,21 +219,38 @@ impl Weights {
             .map(|layer| reader.linear(&layer.name, layer.outputs, layer.inputs))
             .collect::<Result<_, _>>()?;
         let window_values = config.window_steps * config.inputs.len();
-        let rows = config.schedule.as_ref().map_or(1, |s| s.exponents.len()) * config.targets.len();
-        let skip = if config.linear_skip {
-            Some(SkipWeights {
-                weight: reader.take_f64("skip.weight", &[rows, window_values])?,
-                bias: reader.take_f64("skip.bias", &[rows])?,
+        let targets = config.targets.len();
+        let map = |prefix: &str, schedule: Option<&Schedule>, targets: usize| -> Result<_, ModelError> {
+            let rows = schedule.map_or(1, |s| s.exponents.len()) * targets;
+            Ok(SkipWeights {
+                weight: reader.take_f64(&format!("{prefix}.weight"), &[rows, window_values])?,
+                bias: reader.take_f64(&format!("{prefix}.bias"), &[rows])?,
             })
-        } else {
-            None
         };
+        let skip = (config.linear_skip)
+            .then(|| map("skip", config.schedule.as_ref(), targets))
+            .transpose()?;
+        let followed = config.payload.as_ref();
+        let payload = followed.map_or(&[][..], |payload| &payload.estimates);
+        let payload = (payload.iter().enumerate())
+            .map(|(k, schedule)| map(&format!("payload.{k}"), Some(schedule), 1))
+            .collect::<Result<_, _>>()?;
+        let empty = followed
+            .and_then(|payload| payload.empty.as_ref())
+            .map(|empty| map("empty", Some(&empty.schedule), targets))
+            .transpose()?;
         let guard = config
             .guard
             .as_ref()
             .map(|_| reader.linear("guard", config.targets.len(), window_values))
             .transpose()?;
-        Ok(Self { layers, skip, guard })
+        Ok(Self {
+            layers,
+            skip,
+            payload,
+            empty,
+            guard,
+        })
     }
 }
 

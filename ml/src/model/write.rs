@@ -4,6 +4,7 @@ use super::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
+use crate::payload::Following;
 use crate::plot;
 use crate::predict::Predictor;
 use crate::runs::Runs;
@@ -287,9 +288,12 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
             scaled(&mut last.bias[t]);
         }
     }
+    let followed = problem.skip.as_ref().and_then(|skip| skip.payload.as_ref());
     Weights {
         layers,
-        skip: problem.skip.as_ref().map(SkipWeights::from),
+        skip: problem.skip.as_ref().map(|skip| SkipWeights::from(&skip.map)),
+        payload: followed.map_or_else(Vec::new, |f| f.estimates.iter().map(SkipWeights::from).collect()),
+        empty: followed.and_then(|f| f.empty.as_ref().map(|(_, map)| SkipWeights::from(map))),
         guard: Some(LinearWeights::from(&problem.guide)),
     }
 }
@@ -553,7 +557,12 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
         output_steps: problem.output_steps,
         linear_skip: problem.structure.linear_skip,
         input_limits: problem.input_limits.clone(),
-        schedule: problem.skip.as_ref().map(|skip| skip.schedule.clone()),
+        schedule: problem.skip.as_ref().map(|skip| skip.map.schedule.clone()),
+        payload: problem
+            .skip
+            .as_ref()
+            .and_then(|skip| skip.payload.as_ref())
+            .map(Following::config),
         guard: None,
         layers: final_layers(problem),
         provenance: ModelProvenance {
@@ -578,7 +587,7 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
                 problem
                     .skip
                     .as_ref()
-                    .map_or(problem.linear.ridge, |skip| skip.ridge),
+                    .map_or(problem.linear.ridge, |skip| skip.map.ridge),
             ),
             history: outcome.history.clone(),
             ended_by: outcome.ended_by,
@@ -595,12 +604,16 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
 
 fn summary(model: &Model, problem: &Problem, outcome: &Outcome) -> ModelSummary {
     let config = model.config();
-    let skip = if config.linear_skip {
-        let terms = config.schedule.as_ref().map_or(1, |s| s.exponents.len());
-        terms * config.targets.len() * (config.window_steps * config.inputs.len() + 1)
-    } else {
-        0
-    };
+    let targets = config.targets.len();
+    let mut rows = 0;
+    if config.linear_skip {
+        rows += targets * config.schedule.as_ref().map_or(1, |s| s.exponents.len());
+    }
+    if let Some(payload) = &config.payload {
+        rows += payload.estimates.iter().map(|s| s.exponents.len()).sum::<usize>();
+        rows += targets * payload.empty.as_ref().map_or(0, |e| e.schedule.exponents.len());
+    }
+    let skip = rows * (config.window_steps * config.inputs.len() + 1);
     ModelSummary {
         model_sha256: model.sha256().to_owned(),
         dataset_sha256: config.provenance.dataset_sha256.clone(),

@@ -20,7 +20,7 @@ use hydroflex_openapi::model::{Activation, EnvelopeGroup, IntervalTable, ModelCo
 use kernel::{PANEL, PackedLayer};
 pub use scale::Sample;
 use scale::ScaleMap;
-use skip::SkipKernel;
+use skip::Skip;
 
 /// Windows from which on those that are rows are turned into a panel where that is faster: for a skip connection.
 const MANY: usize = 8;
@@ -39,7 +39,7 @@ pub struct Predictor {
     layers: Vec<PackedLayer>,
     /// The same for all estimated samples; none when that is one.
     all_steps: Option<AllSteps>,
-    skip: Option<SkipKernel>,
+    skip: Option<Skip>,
     guard: Option<GuardKernel>,
     /// Of the values of a panel.
     places: Vec<usize>,
@@ -210,14 +210,7 @@ impl Predictor {
         });
         let most = layers.iter().map(PackedLayer::inputs).max().unwrap_or(0);
         let most = most.max(config.window_steps * config.inputs.len());
-        let skip = weights.skip.as_ref().map(|map| {
-            SkipKernel::new(
-                map,
-                config.schedule.as_ref(),
-                &config.inputs,
-                config.targets.len(),
-            )
-        });
+        let skip = Skip::new(config, weights);
         let is_beside = layers.first().is_some_and(|first| first.beside() > 0);
         let guard =
             config.guard.as_ref().zip(guide).map(|(guard, guide)| {
@@ -329,7 +322,7 @@ impl Predictor {
     #[must_use]
     pub fn workspace(&self) -> Workspace {
         let widest = self.layers.iter().map(PackedLayer::padded).max().unwrap_or(0);
-        let skip = self.skip.as_ref().map_or(0, SkipKernel::padded);
+        let skip = self.skip.as_ref().map_or(0, Skip::padded);
         let is_turned = self.skip.as_ref().is_some_and(|skip| !skip.is_narrow());
         let projected = self.envelope.as_ref().map_or(0, |e| e.projection.padded());
         Workspace {

@@ -18,9 +18,9 @@
 )]
 
 use super::kernel::{Level, PANEL, level, pack};
-use crate::model::weights::SkipWeights;
+use crate::model::weights::{SkipWeights, Weights};
 use crate::simd::{Simd, dispatch};
-use hydroflex_openapi::model::{ScaledChannel, Schedule};
+use hydroflex_openapi::model::{ModelConfig, ScaledChannel, Schedule};
 
 /// Outputs in a group.
 const GROUP: usize = 8;
@@ -44,8 +44,163 @@ pub struct SkipKernel {
     tiles: Vec<f64>,
     bias: Vec<f64>,
     slow: Vec<SlowSignal>,
-    /// Terms × slow signals.
+    /// Terms × slow signals, and an estimate where the coefficients follow one.
     exponents: Vec<Vec<i32>>,
+}
+
+/// Skip connections whose coefficients follow an estimate of the payload, see [`crate::payload`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct FollowingKernel {
+    /// Of the estimate, first to last: one target each.
+    estimates: Vec<SkipKernel>,
+    /// Limit of the estimate below which the machine counts as empty, and the map of empty ones.
+    empty: Option<(f64, SkipKernel)>,
+}
+
+/// The whole skip connection of a model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Skip {
+    map: SkipKernel,
+    payload: Option<FollowingKernel>,
+}
+
+impl Skip {
+    /// Packs a model's maps; none without skip connection.
+    #[must_use]
+    pub fn new(config: &ModelConfig, weights: &Weights) -> Option<Self> {
+        let kernel = |map: &SkipWeights, schedule: Option<&Schedule>, targets| {
+            SkipKernel::new(map, schedule, &config.inputs, targets)
+        };
+        let targets = config.targets.len();
+        let map = kernel(weights.skip.as_ref()?, config.schedule.as_ref(), targets);
+        let payload = config.payload.as_ref().map(|payload| FollowingKernel {
+            estimates: payload
+                .estimates
+                .iter()
+                .zip(&weights.payload)
+                .map(|(schedule, map)| kernel(map, Some(schedule), 1))
+                .collect(),
+            empty: payload
+                .empty
+                .as_ref()
+                .zip(weights.empty.as_ref())
+                .map(|(empty, map)| {
+                    let below = (empty.below_kg - payload.centre_kg) / payload.half_range_kg;
+                    (below, kernel(map, Some(&empty.schedule), targets))
+                }),
+        });
+        Some(Self { map, payload })
+    }
+
+    fn maps(&self) -> impl Iterator<Item = &SkipKernel> {
+        let payload = self.payload.iter();
+        let others = payload.flat_map(|p| p.estimates.iter().chain(p.empty.iter().map(|(_, map)| map)));
+        std::iter::once(&self.map).chain(others)
+    }
+
+    /// Values of scratch memory per window, also of a panel's.
+    #[must_use]
+    pub fn padded(&self) -> usize {
+        // The estimate, and the sums of one map after the other.
+        let widest = self.maps().map(SkipKernel::padded).max().unwrap_or(0);
+        widest + usize::from(self.payload.is_some())
+    }
+
+    /// Whether windows that are rows need not be turned into a panel, however many there are.
+    #[must_use]
+    pub fn is_narrow(&self) -> bool {
+        self.maps().all(SkipKernel::is_narrow)
+    }
+
+    /// As [`SkipKernel::add`].
+    ///
+    /// # Panics
+    /// When a slice is too short.
+    pub fn add(&self, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64], out: &mut [f32]) {
+        let Some(payload) = &self.payload else {
+            return self.map.add(x, stride, rows, scratch, out);
+        };
+        let (estimates, scratch) = scratch.split_at_mut(rows);
+        let value = |row: usize| move |position: usize| x[row * stride + position];
+        for (k, map) in payload.estimates.iter().enumerate() {
+            map.sums(level(), x, stride, rows, scratch);
+            for (row, estimate) in estimates.iter_mut().enumerate() {
+                let sums = &scratch[row * map.padded()..];
+                let followed = (k > 0).then_some(*estimate);
+                *estimate = map.combined(0, value(row), |output| sums[output], followed);
+            }
+        }
+        let targets = self.map.targets;
+        let mut add_where =
+            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, follows: bool, scratch: &mut [f64]| {
+                if !estimates.iter().any(|&e| is_its(e)) {
+                    return;
+                }
+                map.sums(level(), x, stride, rows, scratch);
+                for (row, &estimate) in estimates.iter().enumerate().filter(|(_, e)| is_its(**e)) {
+                    let sums = &scratch[row * map.padded()..];
+                    let followed = follows.then_some(estimate);
+                    let out = &mut out[row * targets..(row + 1) * targets];
+                    map.combine(value(row), |output| sums[output], followed, out);
+                }
+            };
+        match &payload.empty {
+            Some((below, empty)) => {
+                add_where(empty, &|e| e < *below, false, scratch);
+                add_where(&self.map, &|e| e >= *below || e.is_nan(), true, scratch);
+            }
+            None => add_where(&self.map, &|_| true, true, scratch),
+        }
+    }
+
+    /// As [`SkipKernel::add_panel`].
+    ///
+    /// # Panics
+    /// When a slice is too short or there are more columns than [`PANEL`].
+    pub fn add_panel(
+        &self,
+        x: &[f32],
+        places: &[usize],
+        columns: usize,
+        scratch: &mut [f64],
+        out: &mut [f32],
+    ) {
+        let Some(payload) = &self.payload else {
+            return self.map.add_panel(x, places, columns, scratch, out);
+        };
+        let (estimates, scratch) = scratch.split_at_mut(PANEL);
+        let estimates = &mut estimates[..columns];
+        let value = |column: usize| move |position: usize| x[places[position] + column];
+        for (k, map) in payload.estimates.iter().enumerate() {
+            map.panel_sums(level(), x, places, columns, scratch);
+            for (column, estimate) in estimates.iter_mut().enumerate() {
+                let followed = (k > 0).then_some(*estimate);
+                let sum = |output: usize| scratch[output * PANEL + column];
+                *estimate = map.combined(0, value(column), sum, followed);
+            }
+        }
+        let targets = self.map.targets;
+        let mut add_where =
+            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, follows: bool, scratch: &mut [f64]| {
+                if !estimates.iter().any(|&e| is_its(e)) {
+                    return;
+                }
+                map.panel_sums(level(), x, places, columns, scratch);
+                for (column, &estimate) in estimates.iter().enumerate().filter(|(_, e)| is_its(**e)) {
+                    let followed = follows.then_some(estimate);
+                    let out = &mut out[column * targets..(column + 1) * targets];
+                    let sum = |output: usize| scratch[output * PANEL + column];
+                    map.combine(value(column), sum, followed, out);
+                }
+            };
+        match &payload.empty {
+            Some((below, empty)) => {
+                add_where(empty, &|e| e < *below, false, scratch);
+                add_where(&self.map, &|e| e >= *below || e.is_nan(), true, scratch);
+            }
+            None => add_where(&self.map, &|_| true, true, scratch),
+        }
+    }
 }
 
 /// u = clamp(gain · scaled + shift, −1, 1) of one value of the window.
@@ -165,25 +320,28 @@ impl SkipKernel {
         if rows == 0 {
             return;
         }
-        assert!(
-            x.len() >= (rows - 1) * stride + self.inputs,
-            "inputs of {rows} rows"
-        );
-        assert!(scratch.len() >= rows * self.padded(), "scratch of {rows} rows");
-        let map = self;
-        {
-            let scratch = &mut *scratch;
-            dispatch!(level, SkipKernel::few(map: &SkipKernel, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64]));
-        }
+        self.sums(level, x, stride, rows, scratch);
         for row in 0..rows {
             let window = &x[row * stride..];
             let sums = &scratch[row * self.padded()..];
             self.combine(
                 |position| window[position],
                 |output| sums[output],
+                None,
                 &mut out[row * self.targets..(row + 1) * self.targets],
             );
         }
+    }
+
+    /// W_t x + b_t of every term, [`Self::padded`] values per row.
+    fn sums(&self, level: Level, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64]) {
+        assert!(
+            x.len() >= (rows - 1) * stride + self.inputs,
+            "inputs of {rows} rows"
+        );
+        assert!(scratch.len() >= rows * self.padded(), "scratch of {rows} rows");
+        let map = self;
+        dispatch!(level, SkipKernel::few(map: &SkipKernel, x: &[f32], stride: usize, rows: usize, scratch: &mut [f64]));
     }
 
     /// The same for a panel: value i of the window in column c is `x[places[i] + c]`. `scratch` holds
@@ -211,6 +369,19 @@ impl SkipKernel {
         scratch: &mut [f64],
         out: &mut [f32],
     ) {
+        self.panel_sums(level, x, places, columns, scratch);
+        for column in 0..columns {
+            self.combine(
+                |position| x[places[position] + column],
+                |output| scratch[output * PANEL + column],
+                None,
+                &mut out[column * self.targets..(column + 1) * self.targets],
+            );
+        }
+    }
+
+    /// W_t x + b_t of every term, [`PANEL`] values per output.
+    fn panel_sums(&self, level: Level, x: &[f32], places: &[usize], columns: usize, scratch: &mut [f64]) {
         let computed = columns.next_multiple_of(PANEL / 2);
         assert!(computed <= PANEL, "a panel has {PANEL} columns");
         assert!(places.len() >= self.inputs, "a place for each input");
@@ -219,36 +390,57 @@ impl SkipKernel {
         assert!(x.len() >= last + computed, "inputs of a panel");
         assert!(scratch.len() >= self.outputs() * PANEL, "scratch of a panel");
         let map = self;
-        {
-            let scratch = &mut *scratch;
-            dispatch!(level, SkipKernel::many(map: &SkipKernel, x: &[f32], places: &[usize], computed: usize, scratch: &mut [f64]));
-        }
-        for column in 0..columns {
-            self.combine(
-                |position| x[places[position] + column],
-                |output| scratch[output * PANEL + column],
-                &mut out[column * self.targets..(column + 1) * self.targets],
-            );
-        }
+        dispatch!(level, SkipKernel::many(map: &SkipKernel, x: &[f32], places: &[usize], computed: usize, scratch: &mut [f64]));
     }
 
     /// Σₜ mₜ times the sums of term t, added to a window's scaled targets.
-    fn combine(&self, value: impl Fn(usize) -> f32, sum: impl Fn(usize) -> f64, out: &mut [f32]) {
+    fn combine(
+        &self,
+        value: impl Fn(usize) -> f32,
+        sum: impl Fn(usize) -> f64,
+        estimate: Option<f64>,
+        out: &mut [f32],
+    ) {
         for (target, slot) in out.iter_mut().enumerate() {
-            let mut total = f64::from(*slot);
-            for (term, exponents) in self.exponents.iter().enumerate() {
-                let power = |(slow, &exponent): (&SlowSignal, &i32)| {
-                    let u = slow.gain * f64::from(value(slow.position)) + slow.shift;
-                    u.clamp(-1.0, 1.0).powi(exponent)
-                };
-                let factor: f64 = self.slow.iter().zip(exponents).map(power).product();
-                total += factor * sum(term * self.targets + target);
-            }
+            let total = self.total(target, f64::from(*slot), &value, &sum, estimate);
             #[allow(clippy::cast_possible_truncation, reason = "scaled estimates are f32")]
             {
                 *slot = total as f32;
             }
         }
+    }
+
+    /// The same of one target, in f64.
+    fn combined(
+        &self,
+        target: usize,
+        value: impl Fn(usize) -> f32,
+        sum: impl Fn(usize) -> f64,
+        estimate: Option<f64>,
+    ) -> f64 {
+        self.total(target, 0.0, &value, &sum, estimate)
+    }
+
+    fn total(
+        &self,
+        target: usize,
+        mut total: f64,
+        value: &impl Fn(usize) -> f32,
+        sum: &impl Fn(usize) -> f64,
+        estimate: Option<f64>,
+    ) -> f64 {
+        for (term, exponents) in self.exponents.iter().enumerate() {
+            let power = |(slow, &exponent): (&SlowSignal, &i32)| {
+                let u = slow.gain * f64::from(value(slow.position)) + slow.shift;
+                u.clamp(-1.0, 1.0).powi(exponent)
+            };
+            let mut factor: f64 = self.slow.iter().zip(exponents).map(power).product();
+            if let (Some(estimate), Some(&exponent)) = (estimate, exponents.get(self.slow.len())) {
+                factor *= estimate.clamp(-1.0, 1.0).powi(exponent);
+            }
+            total += factor * sum(term * self.targets + target);
+        }
+        total
     }
 
     /// Lengths were compared by the caller.

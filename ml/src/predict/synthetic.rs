@@ -73,6 +73,8 @@ impl SyntheticModel {
             skip: structure
                 .linear_skip
                 .then(|| in_f64(&random(&[map("skip", values, spec.targets)], spec.seed + 1).remove(0))),
+            payload: Vec::new(),
+            empty: None,
             guard: None,
         };
         let linear = random(
@@ -238,7 +240,7 @@ fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> Mod
 mod tests {
     use super::super::sliding::SlidingWindow;
     use super::*;
-    use hydroflex_openapi::model::Schedule;
+    use hydroflex_openapi::model::{EmptyMachine, FollowedPayload, Schedule};
 
     fn model(structure: &str) -> SyntheticModel {
         SyntheticModel::new(&SyntheticSpec {
@@ -248,6 +250,30 @@ mod tests {
             seed: 7,
         })
         .unwrap()
+    }
+
+    #[test]
+    fn low_estimates_of_the_payload_take_the_map_of_the_empty_machine() {
+        let model = following();
+        let mut without = following();
+        without.weights.empty.as_mut().unwrap().bias.fill(1.0);
+        let samples = signal(0, 12 * 60);
+        let estimates = |model: &SyntheticModel| {
+            let predictor = model.predictor();
+            let mut out = vec![0.0; 60 * 3];
+            predictor.predict_windows(&samples, &mut out, &mut predictor.workspace());
+            out
+        };
+        let (with, without) = (estimates(&model), estimates(&without));
+        let differ = with
+            .chunks(3)
+            .zip(without.chunks(3))
+            .filter(|(a, b)| a != b)
+            .count();
+        assert!(
+            (10..50).contains(&differ),
+            "{differ} of 60 windows count as empty"
+        );
     }
 
     #[test]
@@ -339,14 +365,84 @@ mod tests {
             }
         }
         if let Some(skip) = &model.weights.skip {
-            for (v, (row, b)) in x.iter_mut().zip(skip.weight.chunks(scaled.len()).zip(&skip.bias)) {
-                *v += b + row.iter().zip(&scaled).map(|(w, v)| w * v).sum::<f64>();
+            for (v, linear) in x.iter_mut().zip(linear_part(model, skip, window, &scaled)) {
+                *v += linear;
             }
         }
         x.iter()
             .zip(&config.targets)
             .map(|(v, channel)| channel.offset + channel.scale * v)
             .collect()
+    }
+
+    /// Scaled targets of the linear part, as the configuration describes it.
+    fn linear_part(model: &SyntheticModel, skip: &SkipWeights, window: &[f64], scaled: &[f64]) -> Vec<f64> {
+        let config = &model.config;
+        let last = &window[window.len() - config.inputs.len()..];
+        let map = |map: &SkipWeights, schedule: Option<&Schedule>, estimate: Option<f64>, targets: usize| {
+            let mut u: Vec<f64> = schedule.map_or_else(Vec::new, |s| {
+                (0..s.inputs.len())
+                    .map(|c| ((last[s.inputs[c]] - s.centre[c]) / s.half_range[c]).clamp(-1.0, 1.0))
+                    .collect()
+            });
+            u.extend(estimate.map(|e| e.clamp(-1.0, 1.0)));
+            let constant = vec![Vec::new()];
+            let exponents = schedule.map_or(&constant, |s| &s.exponents);
+            let mut sum = vec![0.0; targets];
+            for (row, (weights, bias)) in map.weight.chunks(scaled.len()).zip(&map.bias).enumerate() {
+                let linear = bias + weights.iter().zip(scaled).map(|(w, v)| w * v).sum::<f64>();
+                let factors = u.iter().zip(&exponents[row / targets]);
+                let factor: f64 = factors.map(|(u, &e)| u.powi(e.try_into().unwrap())).product();
+                sum[row % targets] += factor * linear;
+            }
+            sum
+        };
+        let mut estimate = None;
+        if let Some(payload) = &config.payload {
+            for (schedule, weights) in payload.estimates.iter().zip(&model.weights.payload) {
+                estimate = Some(map(weights, Some(schedule), estimate, 1)[0]);
+            }
+            if let (Some(empty), Some(weights)) = (&payload.empty, &model.weights.empty)
+                && payload.centre_kg + payload.half_range_kg * estimate.unwrap() < empty.below_kg
+            {
+                return map(weights, Some(&empty.schedule), None, config.targets.len());
+            }
+        }
+        map(skip, config.schedule.as_ref(), estimate, config.targets.len())
+    }
+
+    /// A skip connection whose coefficients follow the second input and a payload that is estimated twice; windows
+    /// whose estimate is low have a map of their own.
+    fn following() -> SyntheticModel {
+        let mut model = scheduled();
+        let schedule = |exponents: &[&[u32]]| Schedule {
+            exponents: exponents.iter().map(|e| e.to_vec()).collect(),
+            ..model.config.schedule.clone().unwrap()
+        };
+        let size = 12 * INPUTS.len();
+        let maps = |rows: usize, seed: u64| {
+            let layer = map("map", size, rows);
+            in_f64(&random(&[layer], seed).remove(0))
+        };
+        let payload = FollowedPayload {
+            centre_kg: 50.0,
+            half_range_kg: 65.0,
+            estimates: vec![
+                schedule(&[&[0], &[1]]),
+                schedule(&[&[0, 0], &[0, 1], &[1, 1], &[0, 2]]),
+            ],
+            empty: Some(EmptyMachine {
+                below_kg: 50.0,
+                schedule: schedule(&[&[0], &[1]]),
+            }),
+        };
+        let main = schedule(&[&[0, 0], &[1, 0], &[0, 1], &[2, 1], &[0, 3]]);
+        model.weights.skip = Some(maps(5 * 3, 11));
+        model.weights.payload = vec![maps(2, 12), maps(4, 13)];
+        model.weights.empty = Some(maps(2 * 3, 14));
+        model.config.schedule = Some(main);
+        model.config.payload = Some(payload);
+        model
     }
 
     /// A skip connection whose coefficients follow the second input.
@@ -375,7 +471,7 @@ mod tests {
     #[test]
     fn an_estimate_has_the_same_bits_whatever_stands_beside_it() {
         let models = ["L", "RLR", "TLTLT", "ELE", "best"].map(model);
-        for (number, model) in models.into_iter().chain([scheduled()]).enumerate() {
+        for (number, model) in models.into_iter().chain([scheduled(), following()]).enumerate() {
             let predictor = model.predictor();
             let mut workspace = predictor.workspace();
             let samples = signal(0, 12 * 130);
@@ -412,7 +508,7 @@ mod tests {
 
     #[test]
     fn every_structure_agrees_with_its_definition_in_f64() {
-        for structure in [
+        let structures = [
             "L",
             "RLR",
             "TLT",
@@ -422,8 +518,13 @@ mod tests {
             "LLL",
             "RLLR",
             "best",
-        ] {
-            let model = model(structure);
+        ];
+        for model in structures
+            .map(model)
+            .into_iter()
+            .chain([scheduled(), following()])
+        {
+            let structure = &model.config.structure;
             let predictor = model.predictor();
             let samples = signal(0, 12 * 50);
             let mut out = vec![0.0; 50 * 3];

@@ -133,6 +133,7 @@ impl Comparison {
             targets: (0..width).map(judge).collect(),
             baselines: Vec::new(),
             inside_envelope: None,
+            flagged_by_length: None,
         })
     }
 }

@@ -6,15 +6,17 @@ use crate::least_squares::{LinearMap, Spectrum, TargetRows, WindowMoments};
 use crate::network::Loss;
 use crate::network::init::initial_parameters;
 use crate::noise::Noise;
-use crate::runs::Runs;
+use crate::payload::{Payloads, Skip};
+use crate::runs::{RunSamples, Runs};
 use crate::scaling::Scaling;
-use crate::scheduled::{RANGE_FACTOR, Sample, ScheduledMap};
+use crate::scheduled::{RANGE_FACTOR, Sample};
 use crate::structure::{Form, Structure, StructureError};
 use crate::window::{Series, WindowError, Windows, window_steps};
 use hydroflex_openapi::channel::{Channel, ChannelRole};
 use hydroflex_openapi::job::{TrainingSpec, WindowCut, WindowRule};
 use hydroflex_openapi::model::DenseLayer;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
 /// Fewest training runs: with fewer the scales and the linear map say nothing about other runs.
 pub const MIN_TRAIN_RUNS: usize = 2;
@@ -58,6 +60,8 @@ pub struct TrainingData {
     /// Runs without a flag that are not trained on, by kind (short, long): they calibrate the intervals and the
     /// envelope. Where none is as long as a window, the validation runs do.
     pub calibration: Vec<Runs>,
+    /// Payload of each run, kg, where it is known: what the linear part of our network may learn to tell.
+    pub payloads_kg: HashMap<u64, f64>,
     /// Hash of the data set.
     pub dataset_sha256: String,
 }
@@ -133,7 +137,7 @@ pub struct Problem {
     /// Least squares on the window: baseline of every model.
     pub linear: LinearMap,
     /// The same with coefficients that follow the pose: the skip connection of our network.
-    pub skip: Option<ScheduledMap>,
+    pub skip: Option<Skip>,
     /// A linear map with small coefficients, near which estimates are kept.
     pub guide: LinearMap,
     /// What is minimised.
@@ -303,9 +307,15 @@ impl Problem {
                     .max(f64::MIN_POSITIVE),
         );
         let skip = if structure.linear_skip {
-            Some(ScheduledMap::fit(
+            let payloads = [&data.train, &data.validation].map(|runs| payloads(data, runs));
+            let payloads = match &payloads {
+                [Some(train), Some(judge)] => Some(Payloads { train, judge }),
+                _ => None,
+            };
+            Some(Skip::fit(
                 sample(&train, &every),
                 sample(&validation, &validation.windows),
+                payloads,
                 &input_scaling,
                 &slow_inputs(&train_inputs),
                 noise_covariance.as_ref(),
@@ -495,7 +505,15 @@ fn sample<'a>(part: &'a Part, windows: &'a Windows) -> Sample<'a> {
         series: &part.series,
         windows,
         targets: &part.targets,
+        only: None,
+        estimates: None,
     }
+}
+
+/// The payload of each run, kg, if all are known.
+fn payloads(data: &TrainingData, runs: &Runs) -> Option<Vec<f64>> {
+    let known = |run: &RunSamples| data.payloads_kg.get(&run.run_id).copied();
+    runs.runs.iter().map(known).collect()
 }
 
 /// Inputs that tell the pose: lengths of cylinders, else angles.
@@ -536,7 +554,7 @@ fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
 
 /// What the skip leaves over of the scaled targets, row by row; the targets themselves without one.
 /// Rows that end no window are 0 where there is a skip.
-fn skip_errors(part: &Part, steps: usize, skip: Option<&ScheduledMap>, scaling: &Scaling) -> Vec<f64> {
+fn skip_errors(part: &Part, steps: usize, skip: Option<&Skip>, scaling: &Scaling) -> Vec<f64> {
     let Some(map) = skip else {
         return part.targets.values.clone();
     };
@@ -562,7 +580,7 @@ fn skip_errors(part: &Part, steps: usize, skip: Option<&ScheduledMap>, scaling: 
 
 /// Median size of what the skip leaves over on the training windows, per target; 1 without skip:
 /// rare windows with large errors do not set the scale of the others. A target that the skip explains to the last bit keeps a floor far below anything measurable.
-fn wanted_scale(part: &Part, steps: usize, skip: Option<&ScheduledMap>, errors: &[f64]) -> Vec<f64> {
+fn wanted_scale(part: &Part, steps: usize, skip: Option<&Skip>, errors: &[f64]) -> Vec<f64> {
     const FLOOR: f64 = 1e-7;
     let width = part.targets.width;
     if skip.is_none() {

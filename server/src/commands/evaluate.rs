@@ -107,6 +107,16 @@ fn describe(report: &EvaluationReport, seen: bool, plot: Option<&Path>) -> Strin
             100.0 * inside
         );
     }
+    if let Some(by_length) = report.flagged_by_length.filter(|l| l.beyond > 0.0) {
+        let _ = write!(
+            text,
+            "; {:.1} % go beyond the cylinder lengths of the training runs ({:.1} % of these are outside the envelope, {:.1} % of \
+             the others)",
+            100.0 * by_length.beyond,
+            100.0 * by_length.flagged_beyond.unwrap_or(0.0),
+            100.0 * by_length.flagged_within.unwrap_or(0.0),
+        );
+    }
     text.push_str("\n\n");
     text.push_str(&table(report));
     text.push_str("\npublished for another boom (the paper's), MAE of the vertical deflection: ");

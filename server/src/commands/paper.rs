@@ -82,8 +82,9 @@ pub struct Args {
     #[arg(long)]
     pub mixed: bool,
     /// Part of these runs that carry exactly nothing, where the machine has other modes than with the smallest payload
-    #[arg(long, default_value_t = 0.0, requires = "mixed")]
-    pub mixed_empty: f64,
+    /// (default: a quarter where the range begins at 0 kg, else none)
+    #[arg(long, requires = "mixed")]
+    pub mixed_empty: Option<f64>,
     /// Largest number of epochs of a training
     #[arg(long)]
     pub epochs: Option<usize>,
@@ -110,9 +111,9 @@ pub fn run(mut args: Args) -> anyhow::Result<()> {
         ensure!(*runs >= 8, "--runs has {runs}, allowed is 8 or more");
     }
     ensure!(
-        (0.0..1.0).contains(&args.mixed_empty),
+        args.mixed_empty.is_none_or(|part| (0.0..1.0).contains(&part)),
         "--mixed-empty is {}, allowed is 0 or more, below 1",
-        args.mixed_empty
+        args.mixed_empty.unwrap_or_default()
     );
     ensure!(args.seeds >= 1, "--seeds is 0, allowed is 1 or more");
     for payload in &args.payloads {

@@ -281,6 +281,7 @@ fn describe(summary: &ModelSummary, out: &Path) -> String {
             targets: summary.validation_least_squares.clone(),
         }],
         inside_envelope: None,
+        flagged_by_length: None,
     };
     text.push_str(table(&report).trim_end());
     text

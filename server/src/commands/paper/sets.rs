@@ -28,9 +28,11 @@ const CYCLE_ANGLE_DEG: f64 = 18.24;
 const RANDOM_CANDIDATES: u64 = 40;
 const CANDIDATES_PER_SIGNAL: u64 = 8;
 /// Random 10 s runs of which those without a flag calibrate.
-const CALIBRATION_CANDIDATES: u64 = 128;
+const CALIBRATION_CANDIDATES: u64 = 1024;
 /// Added to the study's seed for the calibration runs.
 const CALIBRATION_SEED: u64 = 2_000_003;
+/// Part of the runs with random payloads from 0 kg on that carry exactly nothing.
+const MIXED_EMPTY: f64 = 0.25;
 /// Windows of the study in samples: 60 without payload, 100 with.
 const WINDOW_STEPS: [usize; 2] = [60, 100];
 
@@ -139,10 +141,15 @@ fn training_runs(
 
 /// The job of run `index`: evenly spread runs of a range carry exactly nothing, if asked for.
 fn of_run(args: &Args, payload: Payload, spec: &JobSpec, index: u64) -> JobSpec {
-    let empty = |runs: u64| (runs as f64 * args.mixed_empty).floor();
     let mut spec = spec.clone();
-    if matches!(payload, Payload::Range { .. }) && empty(index + 1) > empty(index) {
-        spec.payload_kg = ValueOrRange::Value(0.0);
+    if let Payload::Range { min, .. } = payload {
+        let part = args
+            .mixed_empty
+            .unwrap_or(if min == 0.0 { MIXED_EMPTY } else { 0.0 });
+        let empty = |runs: u64| (runs as f64 * part).floor();
+        if empty(index + 1) > empty(index) {
+            spec.payload_kg = ValueOrRange::Value(0.0);
+        }
     }
     spec
 }
