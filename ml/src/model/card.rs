@@ -97,6 +97,20 @@ fn write_card(text: &mut String, config: &ModelConfig, pictures: &[Picture]) -> 
         "- hydroflex {}, burn {}\n",
         provenance.hydroflex_version, provenance.burn_version
     )?;
+    if let Some(payload) = &config.payload {
+        let empty = payload.empty.as_ref().map_or_else(String::new, |empty| {
+            format!(
+                "; below {:.1} kg the machine counts as empty and has coefficients of its own",
+                empty.below_kg
+            )
+        });
+        writeln!(
+            text,
+            "The payload differed between the training runs. The model is not told it: it estimates it from the window, \
+             {} times, each time better, and its coefficients follow the last estimate{empty}.\n",
+            payload.estimates.len()
+        )?;
+    }
     writeln!(text, "## Limits\n")?;
     let noise = if provenance.spec.noise.is_some() {
         "with the sensor noise named in `config.json`"

@@ -124,6 +124,12 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         Some(path) => Some(calm_runs(&super::open_dataset(path)?)?),
         None => simulated(&dataset, &args.mesh),
     };
+    if follows_payload(&dataset, &spec) {
+        eprintln!(
+            "note: the payload differs between the runs; fitting how the coefficients follow it comes before the first epoch and \
+             takes seconds to minutes"
+        );
+    }
     let bar = training_bar(args.json);
     let mut progress = |progress: Progress| {
         show(&bar, &progress);
@@ -146,6 +152,13 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         return super::print_json(&summary);
     }
     super::print_line(format_args!("{}", describe(&summary, &args.out)))
+}
+
+/// Whether our network's linear part may follow a payload that differs between the runs, see [`hydroflex_ml::payload`].
+fn follows_payload(dataset: &Dataset, spec: &TrainingSpec) -> bool {
+    let mut payloads = dataset.runs().iter().map(|run| run.payload_kg);
+    let first = payloads.next();
+    spec.structure == "best" && spec.noise.is_none() && payloads.any(|kg| Some(kg) != first)
 }
 
 /// Width of the hidden layers.
