@@ -187,7 +187,9 @@ impl MaterialRef {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(
     untagged,
-    expecting = "invalid value, expected a number, or `{\"min\": …, \"max\": …}` for a random one of each run"
+    deny_unknown_fields,
+    expecting = "invalid value, expected a number, or `{\"min\": …, \"max\": …}` for a random one of each run, with `\"empty\": …` for the \
+                 part of the runs at exactly 0"
 )]
 pub enum ValueOrRange {
     /// The same for every run.
@@ -198,7 +200,17 @@ pub enum ValueOrRange {
         min: f64,
         /// Largest value.
         max: f64,
+        /// Part of the runs that carry exactly nothing instead, from 0 to 1, drawn run by run. A machine without payload is another one than
+        /// one with a small payload (no mass at its interface, other modes): a network knows it only if runs of it are in its training.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        empty: f64,
     },
+}
+
+/// Whether a part is what it is by default: such specifications are written as they were before there was a choice.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_zero(part: &f64) -> bool {
+    *part == 0.0
 }
 
 /// Commanded valve signal of a run.

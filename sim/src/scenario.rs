@@ -193,7 +193,9 @@ pub fn material_index(spec: &JobSpec, seed: u64) -> Option<usize> {
 fn payload_kg(spec: &JobSpec, seed: u64) -> f64 {
     match spec.payload_kg {
         ValueOrRange::Value(value) => value,
-        ValueOrRange::Range { min, max } => Stream::new(seed, "payload").uniform(min, max),
+        // A stream of its own: the payloads of the other runs are the same with and without empty ones.
+        ValueOrRange::Range { empty, .. } if Stream::new(seed, "empty").uniform(0.0, 1.0) < empty => 0.0,
+        ValueOrRange::Range { min, max, .. } => Stream::new(seed, "payload").uniform(min, max),
     }
 }
 

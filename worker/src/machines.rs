@@ -136,14 +136,19 @@ impl Machines {
     /// Says why the machine is refused.
     pub fn ready(&self, spec: &JobSpec, blobs: &Blobs) -> Result<Arc<ReadyMachine>, RefusedMachine> {
         let machine = self.loaded(spec, blobs)?;
-        let with_payload = match spec.payload_kg {
-            ValueOrRange::Value(value) => value > 0.0,
-            ValueOrRange::Range { max, .. } => max > 0.0,
+        // A machine without payload is reduced without its interface: another body.
+        let kinds: &[bool] = match spec.payload_kg {
+            ValueOrRange::Value(value) => &[value > 0.0],
+            ValueOrRange::Range { max, empty, .. } if max == 0.0 || empty == 1.0 => &[false],
+            ValueOrRange::Range { empty: 0.0, .. } => &[true],
+            ValueOrRange::Range { .. } => &[true, false],
         };
         let refused = |error| RefusedMachine::Structure(Arc::new(error));
         // One after the other: a reduction has the cores to itself, and its factor in memory.
         for simulator in machine.simulators() {
-            simulator.prepare(with_payload).map_err(refused)?;
+            for &with_payload in kinds {
+                simulator.prepare(with_payload).map_err(refused)?;
+            }
         }
         Ok(machine)
     }

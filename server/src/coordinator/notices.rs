@@ -205,7 +205,11 @@ mod tests {
         assert_eq!(of(&machine, &calm), []);
         // the window of 200 kg is 0.4 s
         let short = JobSpec {
-            payload_kg: ValueOrRange::Range { min: 0.0, max: 200.0 },
+            payload_kg: ValueOrRange::Range {
+                min: 0.0,
+                max: 200.0,
+                empty: 0.0,
+            },
             ..calm.clone()
         };
         let notices = of(&machine, &short);

@@ -72,6 +72,28 @@ fn a_plan_keeps_to_its_ranges_and_does_not_know_its_neighbours() {
 }
 
 #[test]
+fn empty_runs_change_no_other_run() {
+    let machine = machine();
+    let all = job(r#"{"runs": 400, "payload_kg": {"min": 10, "max": 90}}"#);
+    let some = job(r#"{"runs": 400, "payload_kg": {"min": 10, "max": 90, "empty": 0.25}}"#);
+    let mut empty = 0;
+    for run in 0..400 {
+        let before = plan_run(&all, &machine, &Anywhere, run).unwrap();
+        let mut after = plan_run(&some, &machine, &Anywhere, run).unwrap();
+        if after.payload_kg == 0.0 {
+            empty += 1;
+            after.payload_kg = before.payload_kg;
+        }
+        assert_eq!(before, after);
+    }
+    // four standard deviations of a quarter of 400 draws
+    assert!((66..=134).contains(&empty), "{empty}");
+    let unknown =
+        serde_json::from_str::<JobSpec>(r#"{"runs": 8, "payload_kg": {"min": 0, "max": 9, "emtpy": 0.5}}"#);
+    assert!(unknown.unwrap_err().to_string().contains("`\"empty\": …`"));
+}
+
+#[test]
 fn settling_runs_open_the_valve_for_a_fifth_of_at_least_a_second() {
     let (machine, short) = (machine(), job(r#"{"runs": 1, "duration_s": 0.25}"#));
     let run = plan_settling_run(&short, &machine, &Anywhere, 0).unwrap();
@@ -125,6 +147,10 @@ fn every_field_is_looked_at() {
         (
             r#"{"runs": 8, "payload_kg": {"min": 60, "max": 50}}"#,
             "/payload_kg",
+        ),
+        (
+            r#"{"runs": 8, "payload_kg": {"min": 0, "max": 50, "empty": 1.5}}"#,
+            "/payload_kg/empty",
         ),
         (
             r#"{"runs": 8, "initial_angle_deg": {"lift": [0, 91]}}"#,

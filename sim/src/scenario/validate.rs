@@ -137,9 +137,17 @@ fn payload(spec: &JobSpec, machine: &MachineFile, errors: &mut Errors) {
     };
     let holds = match spec.payload_kg {
         ValueOrRange::Value(kg) => fits(kg),
-        ValueOrRange::Range { min, max } => fits(min) && fits(max) && min <= max,
+        ValueOrRange::Range { min, max, .. } => fits(min) && fits(max) && min <= max,
     };
     errors.require(holds, "/payload_kg", spec.payload_kg, allowed);
+    if let ValueOrRange::Range { empty, .. } = spec.payload_kg {
+        errors.require(
+            (0.0..=1.0).contains(&empty),
+            "/payload_kg/empty",
+            empty,
+            "a part of the runs, 0 to 1".to_owned(),
+        );
+    }
 }
 
 /// Checks the materials of a job alone: bodies are reduced of them before the rest of a job is looked at.

@@ -55,7 +55,7 @@ impl Payload {
     fn asked(self) -> ValueOrRange {
         match self {
             Self::Fixed(kg) => ValueOrRange::Value(kg),
-            Self::Range { min, max } => ValueOrRange::Range { min, max },
+            Self::Range { min, max } => ValueOrRange::Range { min, max, empty: 0.0 },
         }
     }
 
