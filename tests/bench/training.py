@@ -232,7 +232,14 @@ def main():
 
 def report(out, rounds, speeds, losses, curves):
     picture = out.with_suffix(".svg")
-    draw(picture, curves)
+    same = []
+    if curves:
+        draw(picture, curves)
+        same = [
+            f"Both learn the same. Training loss (mean squared error, scaled) over the last fifth of {CASES['disjoint'][2]} epochs with 6,144 windows, learning rate",
+            f"1e-3, median and range of {rounds} seeds; the two draw different weights and orders from a seed:", "",
+            "| structure | PyTorch | hydroflex |", "|---|---|---|", *losses, "",
+            f"![Training losses of both, {rounds} seeds each]({picture.name})"]
     out.write_text("\n".join([
         "# Training, beside PyTorch", "",
         f"PyTorch {torch.__version__} at its best (all windows in one tensor, fused Adam) and `hydroflex train`, by `tests/heavy.sh --bench`: window of",
@@ -241,11 +248,7 @@ def report(out, rounds, speeds, losses, curves):
         "each epoch, PyTorch does not: that ratio is a lower bound. Two threads need both cores for themselves: where a neighbour takes",
         "one, PyTorch's threads wait for each other, actively, and the ratio says more about the neighbour.", "",
         "| windows | batch | structure | threads | PyTorch, ms | hydroflex, ms | ratio (least, most) | PyTorch, CPU ms | hydroflex, CPU ms | ratio |",
-        "|---|---:|---|---:|---:|---:|---|---:|---:|---:|", *speeds, "",
-        f"Both learn the same. Training loss (mean squared error, scaled) over the last fifth of {CASES['disjoint'][2]} epochs with 6,144 windows, learning rate",
-        f"1e-3, median and range of {rounds} seeds; the two draw different weights and orders from a seed:", "",
-        "| structure | PyTorch | hydroflex |", "|---|---|---|", *losses, "",
-        f"![Training losses of both, {rounds} seeds each]({picture.name})"]) + "\n")
+        "|---|---:|---|---:|---:|---:|---|---:|---:|---:|", *speeds, "", *same]) + "\n")
 
 
 def draw(picture, curves):

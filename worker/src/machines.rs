@@ -139,7 +139,7 @@ impl Machines {
         // A machine without payload is reduced without its interface: another body.
         let kinds: &[bool] = match spec.payload_kg {
             ValueOrRange::Value(value) => &[value > 0.0],
-            ValueOrRange::Range { max, empty, .. } if max == 0.0 || empty == 1.0 => &[false],
+            ValueOrRange::Range { max, empty, .. } if max == 0.0 || empty >= 1.0 => &[false],
             ValueOrRange::Range { empty: 0.0, .. } => &[true],
             ValueOrRange::Range { .. } => &[true, false],
         };
