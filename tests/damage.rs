@@ -70,7 +70,7 @@ fn damaged_jobs_are_checked_or_refused() {
     let machine = Machine::parse_file(Machine::built_in_text("lift-boom").unwrap()).unwrap();
     let whole = serde_json::json!({
         "title": "night", "machine": "lift-boom", "runs": 80, "seed": 7, "duration_s": 1.0, "sample_time_s": 0.005,
-        "payload_kg": { "min": 0.0, "max": 100.0 }, "initial_angle_deg": { "lift": [-10.0, 50.0] },
+        "payload_kg": { "min": 0.0, "max": 100.0, "empty": 0.2 }, "initial_angle_deg": { "lift": [-10.0, 50.0] },
         "excitation": { "kind": "given", "valve_ratio": { "lift": [0.0, 0.5, 1.0] } },
         "split": { "train": 0.8, "validation": 0.1, "test": 0.1 }, "exclude_flags": ["cavitation"],
         "columns": ["deflection_tip_y_m"], "file_size_mb": 64,

@@ -139,7 +139,8 @@ fn training_runs(
     planned(args, simulator, payload, &spec)
 }
 
-/// The job of run `index`: evenly spread runs of a range carry exactly nothing, if asked for.
+/// The job of run `index`: evenly spread runs of a range carry exactly nothing, if asked for. (A job draws its empty runs; a study's small sets
+/// get the same part of them in each.)
 fn of_run(args: &Args, payload: Payload, spec: &JobSpec, index: u64) -> JobSpec {
     let mut spec = spec.clone();
     if let Payload::Range { min, .. } = payload {
