@@ -173,10 +173,10 @@ impl Skip {
                 .map(|index| {
                     [
                         error(judge, index, |window, out| {
-                            map.apply(scaling, window, Some(of_judge[index]), out)
+                            map.apply(scaling, window, Some(of_judge[index]), out);
                         }),
                         error(judge, index, |window, out| {
-                            of_empty.apply(scaling, window, None, out)
+                            of_empty.apply(scaling, window, None, out);
                         }),
                     ]
                 })
@@ -296,7 +296,7 @@ fn limit(estimates: &[f64], errors: &[[f64; 2]], second: &[usize]) -> Option<f64
         0.5 * (here + next)
     };
     let is_good = |place: &usize| sums[*place] <= (1.0 + SPARED) * least;
-    let best = sums.iter().position(|sum| *sum == least)?;
+    let best = sums.iter().position(|sum| *sum <= least)?;
     let high = (0..sums.len())
         .rev()
         .filter(|place| of_place(*place) <= highest)
