@@ -33,7 +33,7 @@ const RIDGES_TRIED: usize = 4;
 const EMPTY_RUNS: [usize; 2] = [8, 2];
 
 /// Part of the windows without payload whose estimates are below the limit, where that costs the others little.
-const EMPTY_PART: f64 = 0.995;
+const EMPTY_PART: f64 = 0.999;
 /// How little, in the least error.
 const SPARED: f64 = 0.1;
 /// Most mean error, in that of the plain map, with which the payload is followed. The network makes up for more of a plain map's error, which
@@ -194,13 +194,14 @@ impl Skip {
         })
     }
 
-    /// Scaled targets of a scaled window.
+    /// Scaled targets of a scaled window, and whether it took the map of empty machines.
     ///
     /// # Panics
     /// When a slice has another length.
-    pub fn apply(&self, scaling: &Scaling, window: &[f32], out: &mut [f64]) {
+    pub fn apply(&self, scaling: &Scaling, window: &[f32], out: &mut [f64]) -> bool {
         let Some(following) = &self.payload else {
-            return self.map.apply(scaling, window, None, out);
+            self.map.apply(scaling, window, None, out);
+            return false;
         };
         let mut estimate = None;
         for map in &following.estimates {
@@ -211,8 +212,12 @@ impl Skip {
         match &following.empty {
             Some((below, map)) if estimate.is_some_and(|estimate| estimate < *below) => {
                 map.apply(scaling, window, None, out);
+                true
             }
-            _ => self.map.apply(scaling, window, estimate, out),
+            _ => {
+                self.map.apply(scaling, window, estimate, out);
+                false
+            }
         }
     }
 
@@ -221,16 +226,20 @@ impl Skip {
     fn judged(&self, judge: Sample<'_>, scaling: &Scaling) -> f64 {
         let errors: Vec<f64> = (0..judge.windows.len())
             .into_par_iter()
-            .map(|index| error(judge, index, |window, out| self.apply(scaling, window, out)))
+            .map(|index| {
+                error(judge, index, |window, out| {
+                    self.apply(scaling, window, out);
+                })
+            })
             .collect();
         errors.iter().sum::<f64>() / errors.len() as f64
     }
 }
 
 impl Following {
-    /// As a model's configuration has it.
+    /// As a model's configuration has it; `empty_gain`: see [`EmptyMachine::network_gain`].
     #[must_use]
-    pub fn config(&self) -> FollowedPayload {
+    pub fn config(&self, empty_gain: &[f64]) -> FollowedPayload {
         let schedule = |map: &ScheduledMap| -> Schedule { map.schedule.clone() };
         FollowedPayload {
             centre_kg: self.centre_kg,
@@ -239,6 +248,7 @@ impl Following {
             empty: self.empty.as_ref().map(|(below, map)| EmptyMachine {
                 below_kg: self.centre_kg + self.half_range_kg * below,
                 schedule: schedule(map),
+                network_gain: empty_gain.to_vec(),
             }),
         }
     }

@@ -511,27 +511,71 @@ fn a_network_of_several_steps_estimates_the_end_of_its_window() {
         .fold(0.0, f64::max);
     assert!(worst < 0.3e-3, "{worst}");
 
-    for (structure, steps) in [("best", 10), ("TLT", 0)] {
-        let wrong = TrainingSpec {
-            structure: structure.to_owned(),
-            output_steps: Some(steps),
-            ..spec.clone()
-        };
-        let refused = train(
-            &data(),
-            &wrong,
-            &mut go_on,
-            &folder.0.join("c"),
-            &folder.0.join("n"),
-        );
-        assert!(
-            matches!(
-                refused,
-                Err(TrainError::SingleStep { .. } | TrainError::NotPositive { .. })
-            ),
-            "{refused:?}"
-        );
+    let wrong = TrainingSpec {
+        output_steps: Some(0),
+        ..spec
+    };
+    let refused = train(
+        &data(),
+        &wrong,
+        &mut go_on,
+        &folder.0.join("c"),
+        &folder.0.join("n"),
+    );
+    assert!(
+        matches!(refused, Err(TrainError::NotPositive { .. })),
+        "{refused:?}"
+    );
+}
+
+#[test]
+fn our_network_of_several_steps_has_a_linear_map_for_each() {
+    let folder = Folder::new("several-best");
+    let spec = TrainingSpec {
+        output_steps: Some(10),
+        ..spec("best", 60)
+    };
+    train(
+        &data(),
+        &spec,
+        &mut go_on,
+        &folder.0.join("c"),
+        &folder.0.join("m"),
+    )
+    .unwrap();
+    let model = Model::load(&folder.0.join("m")).unwrap();
+    let config = model.config();
+    assert_eq!(
+        (config.window_steps, config.output_steps, config.skip_steps()),
+        (30, 10, 21)
+    );
+    let predictor = model.predictor();
+    let mut workspace = predictor.workspace();
+    let unseen = oscillators(4, 200);
+    let run = &unseen.runs[0];
+    let window_at = |last: usize| -> Vec<f64> {
+        (last - 29..=last)
+            .flat_map(|row| [run.columns[0][row], run.columns[1][row]])
+            .collect()
+    };
+    let all = predictor.predict_all_steps(&window_at(69), &mut workspace);
+    let scale = config.targets[0].scale;
+    for (row, estimate) in (60..70).zip(&all) {
+        let error = (run.columns[2][row] - estimate).abs();
+        assert!(error < 0.01 * scale, "sample {row}: {error:.1e} of {scale:.1e}");
     }
+    // One after the other, few together, and a whole recording: the same estimates of the last samples.
+    let mut last = [0.0];
+    predictor.predict_window(&window_at(69), &mut last, &mut workspace);
+    assert!((all[9] - last[0]).abs() < 1e-6 * scale, "{} {}", all[9], last[0]);
+    let columns = [&run.columns[0][..], &run.columns[1][..]];
+    let series = predictor.predict_series(&columns);
+    assert_eq!(series.first_row, 29);
+    let windows: Vec<f64> = (60..80).flat_map(window_at).collect();
+    let mut together = vec![0.0; 20];
+    predictor.predict_windows(&windows, &mut together, &mut workspace);
+    assert_eq!(&together[..], &series.columns[0][31..51]);
+    assert!((together[9] - last[0]).abs() < 1e-12);
 }
 
 #[test]

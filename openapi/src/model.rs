@@ -33,7 +33,8 @@ pub struct ModelConfig {
     /// targets, oldest first. Estimates are the last row.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub output_steps: usize,
-    /// Whether a linear map of the window (`skip.*`) is added to the network's output.
+    /// Whether a linear map (`skip.*`) is added to the network's output: a map of the last `window_steps + 1 − output_steps` samples up to
+    /// each one that is estimated.
     pub linear_skip: bool,
     /// Slow signals that the coefficients of the linear map follow; absent when they are constant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -65,6 +66,14 @@ pub struct ModelConfig {
     pub envelope: Option<Envelope>,
     /// Windows with their estimates, checked whenever the model is loaded.
     pub golden: Vec<GoldenPrediction>,
+}
+
+impl ModelConfig {
+    /// Samples that the linear map takes for each sample that is estimated, that one among them.
+    #[must_use]
+    pub fn skip_steps(&self) -> usize {
+        (self.window_steps + 1).saturating_sub(self.output_steps)
+    }
 }
 
 fn one() -> usize {
@@ -121,7 +130,9 @@ pub struct Schedule {
 /// with the schedule `estimates[k]`. `e` is the payload in units of its range, `(payload − centre_kg) / half_range_kg`. The schedules
 /// of the later estimates and of the skip have an exponent more per term than slow signals, the last one: that of
 /// `clamp(e_(k−1), −1, 1)`. Where there is `empty` and the last estimate is below its limit, the linear map `empty.*` takes the
-/// place of the skip.
+/// place of the skip, and the network's output is multiplied by its gain.
+///
+/// With `output_steps` above 1 all of it is done for each estimated sample, with the samples up to it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FollowedPayload {
@@ -144,6 +155,9 @@ pub struct EmptyMachine {
     pub below_kg: f64,
     /// Of its linear map.
     pub schedule: Schedule,
+    /// What the network's output is multiplied by for such a machine, one value per target: this map leaves less over. Absent: 1.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub network_gain: Vec<f64>,
 }
 
 /// Bounds of the estimates, one value per target, in its column's unit:

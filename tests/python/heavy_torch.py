@@ -32,7 +32,8 @@ class Slide(torch.nn.Module):
             modules.append(torch.nn.Linear(layer["inputs"], layer["outputs"]))
             modules += [ACTIVATIONS[name]() for name in layer["activations"]]
         self.net = torch.nn.Sequential(*modules)
-        size, targets = config["window_steps"] * len(config["inputs"]), len(config["targets"])
+        targets, self.steps = len(config["targets"]), config.get("output_steps", 1)
+        size = (config["window_steps"] + 1 - self.steps) * len(config["inputs"])
 
         def linear(schedule, targets):
             return torch.nn.Linear(size, (len(schedule["exponents"]) if schedule else 1) * targets, dtype=torch.float64)
@@ -65,20 +66,24 @@ class Slide(torch.nn.Module):
         payload, estimate = self.config.get("payload"), None
         for linear, schedule in zip(self.payload, payload["estimates"]) if payload else ():
             estimate = self.scheduled(linear, schedule, x, raw_last, estimate)[:, 0]
-        y = self.scheduled(self.skip, self.config.get("schedule"), x, raw_last, estimate)
+        y, gain = self.scheduled(self.skip, self.config.get("schedule"), x, raw_last, estimate), 1.0
         if payload and (empty := payload.get("empty")):
             below = (empty["below_kg"] - payload["centre_kg"]) / payload["half_range_kg"]
-            y = torch.where((estimate < below)[:, None], self.scheduled(self.empty, empty["schedule"], x, raw_last, None), y)
-        return y
+            is_empty = (estimate < below)[:, None]
+            y = torch.where(is_empty, self.scheduled(self.empty, empty["schedule"], x, raw_last, None), y)
+            gain = torch.where(is_empty, torch.tensor(empty["network_gain"], dtype=torch.float64), 1.0)
+        return y, gain
 
     def forward(self, x, raw_last):
         """Scaled windows and the sensors at their ends to estimates in physical units."""
         config = self.config
         # A model's inputs are f32: the linear map's large coefficients would show what rounding takes.
         x = x.float().double()
-        y = self.net(x.float()).double()
+        # Of several estimated samples the last is the estimate; the linear map takes the samples up to it.
+        y = self.net(x.float()).double()[:, -len(config["targets"]):]
         if config["linear_skip"]:
-            y = y + self.linear_part(x, raw_last)
+            linear, gain = self.linear_part(x[:, (self.steps - 1) * len(config["inputs"]):], raw_last)
+            y = gain * y + linear
         if guard := config.get("guard"):
             offset, scale = column_of(config["targets"], "offset"), column_of(config["targets"], "scale")
             guide, slack = self.guard(x.float()).double(), torch.tensor(guard["slack"]) / scale

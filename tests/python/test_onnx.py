@@ -29,9 +29,10 @@ def main():
         try:
             test_triton.JOB["train"] = [
                 {"structure": structure, "epochs": 3, "window": {"rule": "given", "window_s": 0.1}}
-                for structure in ("best", "TLSLTLSLT", "TDLT")
+                for structure in ("best", "TLSLTLSLT", "TDLT", "best")
             ]
-            test_triton.JOB["train"][2]["output_steps"] = 10
+            for several in test_triton.JOB["train"][2:]:
+                several["output_steps"] = 10
             test_triton.trained_model(service)
             for model in service.ask("/v1/models")["models"]:
                 check(service, model["model_id"])
@@ -54,16 +55,19 @@ def unknown_payload(folder):
     pyarrow.parquet.write_table(table, folder / "runs.parquet")
     binary = os.environ.get("HYDROFLEX_BIN", "target/release/hydroflex")
     for arguments in (["simulate", "--machine", "lift-boom", "--runs", folder / "runs.parquet", "--out", folder / "set"],
-                      ["train", "--data", folder / "set", "--out", folder / "model", "--epochs", "3", "--window-s", "0.2"]):
+                      ["train", "--data", folder / "set", "--out", folder / "model", "--epochs", "3", "--window-s", "0.2"],
+                      ["train", "--data", folder / "set", "--out", folder / "several", "--epochs", "3", "--window-s", "0.2", "--output-steps", "5"]):
         subprocess.run([binary, *arguments], check=True, capture_output=True)
-    config = json.loads((folder / "model" / "config.json").read_text())
-    assert config["payload"]["empty"] and len(config["payload"]["estimates"]) == 4, "the payload is followed"
-    session = onnxruntime.InferenceSession(folder / "model" / "model.onnx", providers=["CPUExecutionProvider"])
-    windows = numpy.array([golden["window"] for golden in config["golden"]]).reshape(-1, config["window_steps"], len(config["inputs"]))
-    ours = numpy.array([golden["estimates"] for golden in config["golden"]])
-    scale = numpy.array([channel["scale"] for channel in config["targets"]])
-    theirs = session.run(["estimates"], {"window": windows})[0]
-    assert (numpy.abs(ours - theirs) / scale).max() <= NEAR, "an unknown payload"
+    for model in (folder / "model", folder / "several"):
+        config = json.loads((model / "config.json").read_text())
+        assert config["payload"]["empty"] and len(config["payload"]["estimates"]) == 4, "the payload is followed"
+        session = onnxruntime.InferenceSession(model / "model.onnx", providers=["CPUExecutionProvider"])
+        windows = numpy.array([golden["window"] for golden in config["golden"]])
+        windows = windows.reshape(-1, config["window_steps"], len(config["inputs"]))
+        ours = numpy.array([golden["estimates"] for golden in config["golden"]])
+        scale = numpy.array([channel["scale"] for channel in config["targets"]])
+        theirs = session.run(["estimates"], {"window": windows})[0]
+        assert (numpy.abs(ours - theirs) / scale).max() <= NEAR, "an unknown payload"
 
 
 def check(service, model):

@@ -252,12 +252,9 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
             "the last layer does not give one value per target and estimated sample",
         ));
     }
-    if config.output_steps == 0
-        || config.output_steps > config.window_steps
-        || (config.output_steps > 1 && config.linear_skip)
-    {
+    if config.output_steps == 0 || config.output_steps > config.window_steps {
         return Err(inconsistent(
-            "a network estimates one sample, or, without a linear map, several of its window",
+            "a network estimates one or several samples of its window",
         ));
     }
     if config.layers.is_empty() && !config.linear_skip {
@@ -278,6 +275,15 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
             && payload.empty.as_ref().is_none_or(|e| e.below_kg.is_finite()))
         {
             return Err(inconsistent("the followed payload's range is none"));
+        }
+        let gain = payload
+            .empty
+            .as_ref()
+            .map_or(&[][..], |empty| &empty.network_gain);
+        if !(gain.is_empty() || gain.len() == config.targets.len()) || gain.iter().any(|g| !g.is_finite()) {
+            return Err(inconsistent(
+                "the network's gain for empty machines must be finite, one value per target",
+            ));
         }
         schedules.extend(payload.estimates.iter().enumerate().map(|(k, s)| (s, k > 0)));
         schedules.extend(payload.empty.iter().map(|empty| (&empty.schedule, false)));

@@ -160,18 +160,19 @@ pub fn to_onnx(config: &ModelConfig, weights: &Weights) -> Vec<u8> {
         }
     }
     x = graph.cast(&x, DOUBLE);
-    let all = x.clone();
     let (steps, targets) = (config.output_steps, config.targets.len());
-    if steps > 1 {
-        x = graph.columns("last_step", &x, (steps - 1) * targets, targets);
-    }
     if let Some(skip) = &weights.skip {
-        let linear = graph.skip(config, weights, skip, &rounded, window_values);
+        let (linear, gain) = graph.skip_of_steps(config, weights, skip, &rounded);
         x = if config.layers.is_empty() {
             linear
         } else {
+            let x = gain.map_or(x.clone(), |gain| graph.node("Mul", &[&x, &gain], Vec::new()));
             graph.node("Add", &[&x, &linear], Vec::new())
         };
+    }
+    let all = x.clone();
+    if steps > 1 {
+        x = graph.columns("last_step", &x, (steps - 1) * targets, targets);
     }
     if let Some((guard, guide)) = config.guard.as_ref().zip(weights.guard.as_ref()) {
         x = graph.limit(guard, guide, &config.targets, &window, &x);
@@ -340,7 +341,34 @@ impl Graph {
         self.node("Gather", &[x, &indices], vec![integer("axis", 1)])
     }
 
-    /// The linear map in f64, with the payload that it follows.
+    /// The linear map of the samples up to each one that is estimated, step by step, and what the network is multiplied by, if anything.
+    fn skip_of_steps(
+        &mut self,
+        config: &ModelConfig,
+        weights: &Weights,
+        map: &SkipWeights,
+        flat: &str,
+    ) -> (String, Option<String>) {
+        let (steps, channels) = (config.output_steps, config.inputs.len());
+        let values = config.skip_steps() * channels;
+        if steps == 1 {
+            return self.skip(config, weights, map, flat, values);
+        }
+        let raw = |values: &mut dyn Iterator<Item = i64>| values.flat_map(i64::to_le_bytes).collect();
+        let mut places = (0..steps).flat_map(|step| (step * channels..step * channels + values).map(to_i64));
+        let places = self.constant("skip_windows", INT64, &[steps, values], raw(&mut places));
+        let windows = self.node("Gather", &[flat, &places], vec![integer("axis", 1)]);
+        let row = raw(&mut [-1, to_i64(values)].into_iter());
+        let row = self.constant("skip_window_shape", INT64, &[2], row);
+        let windows = self.node("Reshape", &[&windows, &row], Vec::new());
+        let (estimates, gain) = self.skip(config, weights, map, &windows, values);
+        let all = raw(&mut [-1, to_i64(steps * config.targets.len())].into_iter());
+        let all = self.constant("skip_steps_shape", INT64, &[2], all);
+        let mut of_steps = |rows: &str| self.node("Reshape", &[rows, &all], Vec::new());
+        (of_steps(&estimates), gain.map(|gain| of_steps(&gain)))
+    }
+
+    /// The linear map in f64, with the payload that it follows, and what the network is multiplied by, if anything.
     fn skip(
         &mut self,
         config: &ModelConfig,
@@ -348,7 +376,7 @@ impl Graph {
         map: &SkipWeights,
         flat: &str,
         window_values: usize,
-    ) -> String {
+    ) -> (String, Option<String>) {
         let targets = config.targets.len();
         let terms = |graph: &mut Self, name: &str, map, schedule, estimate: Option<&str>, targets| {
             let terms = Terms {
@@ -361,7 +389,8 @@ impl Graph {
             graph.terms(config, &terms, flat, window_values)
         };
         let Some(payload) = &config.payload else {
-            return terms(self, "skip", map, config.schedule.as_ref(), None, targets);
+            let linear = terms(self, "skip", map, config.schedule.as_ref(), None, targets);
+            return (linear, None);
         };
         let mut estimate: Option<String> = None;
         let mut followed: Option<String> = None;
@@ -385,9 +414,15 @@ impl Graph {
                 let below = (empty.below_kg - payload.centre_kg) / payload.half_range_kg;
                 let below = self.doubles("empty_below", std::iter::once(below));
                 let is_empty = self.node("Less", &[&estimate, &below], Vec::new());
-                self.node("Where", &[&is_empty, &empty_map, &loaded], Vec::new())
+                let linear = self.node("Where", &[&is_empty, &empty_map, &loaded], Vec::new());
+                let gain = (!empty.network_gain.is_empty()).then(|| {
+                    let gain = self.doubles("empty_gain", empty.network_gain.iter().copied());
+                    let one = self.doubles("one", std::iter::once(1.0));
+                    self.node("Where", &[&is_empty, &gain, &one], Vec::new())
+                });
+                (linear, gain)
             }
-            _ => loaded,
+            _ => (loaded, None),
         }
     }
 

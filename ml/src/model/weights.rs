@@ -219,11 +219,12 @@ impl Weights {
             .map(|layer| reader.linear(&layer.name, layer.outputs, layer.inputs))
             .collect::<Result<_, _>>()?;
         let window_values = config.window_steps * config.inputs.len();
+        let skip_values = config.skip_steps() * config.inputs.len();
         let targets = config.targets.len();
         let map = |prefix: &str, schedule: Option<&Schedule>, targets: usize| -> Result<_, ModelError> {
             let rows = schedule.map_or(1, |s| s.exponents.len()) * targets;
             Ok(SkipWeights {
-                weight: reader.take_f64(&format!("{prefix}.weight"), &[rows, window_values])?,
+                weight: reader.take_f64(&format!("{prefix}.weight"), &[rows, skip_values])?,
                 bias: reader.take_f64(&format!("{prefix}.bias"), &[rows])?,
             })
         };

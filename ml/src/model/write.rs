@@ -4,7 +4,6 @@ use super::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use super::{Model, ModelError, card};
 use crate::evaluate::{self, metrics::metrics};
 use crate::least_squares::{Spectrum, TargetRows, WindowMoments};
-use crate::payload::Following;
 use crate::plot;
 use crate::predict::Predictor;
 use crate::runs::Runs;
@@ -280,7 +279,8 @@ fn fold(problem: &Problem, parameters: &[f32]) -> Weights {
     }
     if let Some(last) = layers.last_mut() {
         let inputs = last.weight.len() / last.bias.len();
-        for (t, &scale) in problem.wanted_scale.iter().enumerate() {
+        let scales = problem.wanted_scale.iter().cycle();
+        for (t, &scale) in scales.take(last.bias.len()).enumerate() {
             let scaled = |w: &mut f32| *w = (f64::from(*w) * scale) as f32;
             last.weight[t * inputs..(t + 1) * inputs]
                 .iter_mut()
@@ -562,7 +562,7 @@ fn config(problem: &Problem, outcome: &Outcome, data: &TrainingData) -> ModelCon
             .skip
             .as_ref()
             .and_then(|skip| skip.payload.as_ref())
-            .map(Following::config),
+            .map(|following| following.config(&problem.empty_gain)),
         guard: None,
         layers: final_layers(problem),
         provenance: ModelProvenance {
@@ -613,7 +613,7 @@ fn summary(model: &Model, problem: &Problem, outcome: &Outcome) -> ModelSummary 
         rows += payload.estimates.iter().map(|s| s.exponents.len()).sum::<usize>();
         rows += targets * payload.empty.as_ref().map_or(0, |e| e.schedule.exponents.len());
     }
-    let skip = rows * (config.window_steps * config.inputs.len() + 1);
+    let skip = rows * (config.skip_steps() * config.inputs.len() + 1);
     ModelSummary {
         model_sha256: model.sha256().to_owned(),
         dataset_sha256: config.provenance.dataset_sha256.clone(),

@@ -40,6 +40,8 @@ pub struct Predictor {
     /// The same for all estimated samples; none when that is one.
     all_steps: Option<AllSteps>,
     skip: Option<Skip>,
+    /// First value of a window that the skip takes for its last sample.
+    skip_from: usize,
     guard: Option<GuardKernel>,
     /// Of the values of a panel.
     places: Vec<usize>,
@@ -234,6 +236,7 @@ impl Predictor {
             layers,
             all_steps,
             skip,
+            skip_from: (config.window_steps - config.skip_steps()) * config.inputs.len(),
             guard,
             places: (0..most).map(|place| place * PANEL).collect(),
             intervals: config.intervals.clone(),
@@ -284,7 +287,7 @@ impl Predictor {
     }
 
     /// Estimates of the last [`Self::output_steps`] samples of one window, oldest first, a row of targets each, in the
-    /// columns' units: what a network that estimates several samples gives at once, held within the range of each target.
+    /// columns' units: what a model that estimates several samples gives at once, held within the range of each target.
     /// [`Self::predict_window`] gives the last row, bounded more closely.
     ///
     /// # Panics
@@ -300,13 +303,24 @@ impl Predictor {
         };
         let mut x = std::mem::take(&mut workspace.window);
         self.maps.scale(window, &mut x);
-        let mut values = x[..window.len()].to_vec();
-        workspace.window = x;
-        for layer in &all.layers {
-            let mut out = vec![0.0; layer.padded()];
-            layer.forward(&values, values.len(), 1, &mut out);
-            values = out;
+        let x_scaled = &x[..window.len()];
+        let mut values = vec![0.0; all.steps * targets];
+        if let Some((first, others)) = all.layers.split_first() {
+            values = vec![0.0; first.padded()];
+            first.forward(x_scaled, x_scaled.len(), 1, &mut values);
+            for layer in others {
+                let mut out = vec![0.0; layer.padded()];
+                layer.forward(&values, values.len(), 1, &mut out);
+                values = out;
+            }
         }
+        if let Some(kernel) = &self.skip {
+            // One window for each step, a sample apart.
+            let mut scratch = vec![0.0; kernel.padded() * all.steps];
+            let values = &mut values[..all.steps * targets];
+            kernel.add(x_scaled, self.inputs.len(), all.steps, &mut scratch, values);
+        }
+        workspace.window = x;
         values[..all.steps * targets]
             .iter()
             .enumerate()
@@ -539,12 +553,13 @@ impl Predictor {
                     }
                 }
                 if let Some(kernel) = &self.skip {
+                    let x = &x[self.skip_from..];
                     if kernel.is_narrow() || rows < MANY {
                         kernel.add(x, stride, rows, skip, scaled);
                     } else {
                         for first in (0..rows).step_by(PANEL) {
                             let (x, columns) = (&x[first * stride..], PANEL.min(rows - first));
-                            panel::transpose(x, stride, columns, self.window_len(), panel);
+                            panel::transpose(x, stride, columns, self.window_len() - self.skip_from, panel);
                             let scaled = &mut scaled[first * targets..(first + columns) * targets];
                             kernel.add_panel(panel, &self.places, columns, skip, scaled);
                         }
@@ -570,7 +585,7 @@ impl Predictor {
                     }
                 }
                 if let Some(kernel) = &self.skip {
-                    kernel.add_panel(x, places, rows, skip, scaled);
+                    kernel.add_panel(x, &places[self.skip_from..], rows, skip, scaled);
                 }
                 if let Some(kernel) = &self.guard {
                     kernel.limit_panel(x, places, rows, guide, scaled, limited);

@@ -53,8 +53,16 @@ pub struct SkipKernel {
 pub struct FollowingKernel {
     /// Of the estimate, first to last: one target each.
     estimates: Vec<SkipKernel>,
-    /// Limit of the estimate below which the machine counts as empty, and the map of empty ones.
-    empty: Option<(f64, SkipKernel)>,
+    empty: Option<EmptyKernel>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct EmptyKernel {
+    /// Limit of the estimate below which the machine counts as empty.
+    below: f64,
+    map: SkipKernel,
+    /// Of the network's output, one per target.
+    gain: Vec<f32>,
 }
 
 /// The whole skip connection of a model.
@@ -84,9 +92,10 @@ impl Skip {
                 .empty
                 .as_ref()
                 .zip(weights.empty.as_ref())
-                .map(|(empty, map)| {
-                    let below = (empty.below_kg - payload.centre_kg) / payload.half_range_kg;
-                    (below, kernel(map, Some(&empty.schedule), targets))
+                .map(|(empty, map)| EmptyKernel {
+                    below: (empty.below_kg - payload.centre_kg) / payload.half_range_kg,
+                    map: kernel(map, Some(&empty.schedule), targets),
+                    gain: gain(&empty.network_gain, targets),
                 }),
         });
         Some(Self { map, payload })
@@ -94,7 +103,7 @@ impl Skip {
 
     fn maps(&self) -> impl Iterator<Item = &SkipKernel> {
         let payload = self.payload.iter();
-        let others = payload.flat_map(|p| p.estimates.iter().chain(p.empty.iter().map(|(_, map)| map)));
+        let others = payload.flat_map(|p| p.estimates.iter().chain(p.empty.iter().map(|empty| &empty.map)));
         std::iter::once(&self.map).chain(others)
     }
 
@@ -132,24 +141,25 @@ impl Skip {
         }
         let targets = self.map.targets;
         let mut add_where =
-            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, follows: bool, scratch: &mut [f64]| {
+            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, gain: Option<&[f32]>, scratch: &mut [f64]| {
                 if !estimates.iter().any(|&e| is_its(e)) {
                     return;
                 }
                 map.sums(level(), x, stride, rows, scratch);
                 for (row, &estimate) in estimates.iter().enumerate().filter(|(_, e)| is_its(**e)) {
                     let sums = &scratch[row * map.padded()..];
-                    let followed = follows.then_some(estimate);
+                    let followed = gain.is_none().then_some(estimate);
                     let out = &mut out[row * targets..(row + 1) * targets];
+                    multiply(out, gain);
                     map.combine(value(row), |output| sums[output], followed, out);
                 }
             };
         match &payload.empty {
-            Some((below, empty)) => {
-                add_where(empty, &|e| e < *below, false, scratch);
-                add_where(&self.map, &|e| e >= *below || e.is_nan(), true, scratch);
+            Some(EmptyKernel { below, map, gain }) => {
+                add_where(map, &|e| e < *below, Some(gain), scratch);
+                add_where(&self.map, &|e| e >= *below || e.is_nan(), None, scratch);
             }
-            None => add_where(&self.map, &|_| true, true, scratch),
+            None => add_where(&self.map, &|_| true, None, scratch),
         }
     }
 
@@ -181,25 +191,42 @@ impl Skip {
         }
         let targets = self.map.targets;
         let mut add_where =
-            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, follows: bool, scratch: &mut [f64]| {
+            |map: &SkipKernel, is_its: &dyn Fn(f64) -> bool, gain: Option<&[f32]>, scratch: &mut [f64]| {
                 if !estimates.iter().any(|&e| is_its(e)) {
                     return;
                 }
                 map.panel_sums(level(), x, places, columns, scratch);
                 for (column, &estimate) in estimates.iter().enumerate().filter(|(_, e)| is_its(**e)) {
-                    let followed = follows.then_some(estimate);
+                    let followed = gain.is_none().then_some(estimate);
                     let out = &mut out[column * targets..(column + 1) * targets];
+                    multiply(out, gain);
                     let sum = |output: usize| scratch[output * PANEL + column];
                     map.combine(value(column), sum, followed, out);
                 }
             };
         match &payload.empty {
-            Some((below, empty)) => {
-                add_where(empty, &|e| e < *below, false, scratch);
-                add_where(&self.map, &|e| e >= *below || e.is_nan(), true, scratch);
+            Some(EmptyKernel { below, map, gain }) => {
+                add_where(map, &|e| e < *below, Some(gain), scratch);
+                add_where(&self.map, &|e| e >= *below || e.is_nan(), None, scratch);
             }
-            None => add_where(&self.map, &|_| true, true, scratch),
+            None => add_where(&self.map, &|_| true, None, scratch),
         }
+    }
+}
+
+/// What the network gave, where another map than the loaded machine's is added to it.
+fn multiply(out: &mut [f32], gain: Option<&[f32]>) {
+    for (value, gain) in out.iter_mut().zip(gain.unwrap_or(&[])) {
+        *value *= gain;
+    }
+}
+
+/// One gain per target; 1 where none is told.
+#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+fn gain(told: &[f64], targets: usize) -> Vec<f32> {
+    match told {
+        [] => vec![1.0; targets],
+        told => told.iter().map(|&gain| gain as f32).collect(),
     }
 }
 

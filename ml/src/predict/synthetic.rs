@@ -365,8 +365,9 @@ mod tests {
             }
         }
         if let Some(skip) = &model.weights.skip {
-            for (v, linear) in x.iter_mut().zip(linear_part(model, skip, window, &scaled)) {
-                *v += linear;
+            let (linear, gain) = linear_part(model, skip, window, &scaled);
+            for (v, (linear, gain)) in x.iter_mut().zip(linear.iter().zip(gain)) {
+                *v = gain * *v + linear;
             }
         }
         x.iter()
@@ -375,9 +376,15 @@ mod tests {
             .collect()
     }
 
-    /// Scaled targets of the linear part, as the configuration describes it.
-    fn linear_part(model: &SyntheticModel, skip: &SkipWeights, window: &[f64], scaled: &[f64]) -> Vec<f64> {
+    /// Scaled targets of the linear part and the gain of the network's, as the configuration describes them.
+    fn linear_part(
+        model: &SyntheticModel,
+        skip: &SkipWeights,
+        window: &[f64],
+        scaled: &[f64],
+    ) -> (Vec<f64>, Vec<f64>) {
         let config = &model.config;
+        let targets = config.targets.len();
         let last = &window[window.len() - config.inputs.len()..];
         let map = |map: &SkipWeights, schedule: Option<&Schedule>, estimate: Option<f64>, targets: usize| {
             let mut u: Vec<f64> = schedule.map_or_else(Vec::new, |s| {
@@ -405,10 +412,12 @@ mod tests {
             if let (Some(empty), Some(weights)) = (&payload.empty, &model.weights.empty)
                 && payload.centre_kg + payload.half_range_kg * estimate.unwrap() < empty.below_kg
             {
-                return map(weights, Some(&empty.schedule), None, config.targets.len());
+                let linear = map(weights, Some(&empty.schedule), None, targets);
+                return (linear, empty.network_gain.clone());
             }
         }
-        map(skip, config.schedule.as_ref(), estimate, config.targets.len())
+        let linear = map(skip, config.schedule.as_ref(), estimate, targets);
+        (linear, vec![1.0; targets])
     }
 
     /// A skip connection whose coefficients follow the second input and a payload that is estimated twice; windows
@@ -434,6 +443,7 @@ mod tests {
             empty: Some(EmptyMachine {
                 below_kg: 50.0,
                 schedule: schedule(&[&[0], &[1]]),
+                network_gain: vec![0.25, 1.0, 3.0],
             }),
         };
         let main = schedule(&[&[0, 0], &[1, 0], &[0, 1], &[2, 1], &[0, 3]]);

@@ -101,7 +101,7 @@ pub enum TrainError {
     },
     /// Several samples at once from a network that gives one.
     #[error(
-        "output_steps is above 1: structure {structure:?} estimates one sample; give letters such as RLR"
+        "output_steps is above 1: structure {structure:?} estimates one sample; give `best` or letters such as RLR"
     )]
     SingleStep {
         /// Structure.

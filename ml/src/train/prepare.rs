@@ -146,6 +146,8 @@ pub struct Problem {
     pub input_limits: Vec<[f64; 2]>,
     /// Typical size of what the network learns, per target, in scaled units (1 without skip).
     pub wanted_scale: Vec<f64>,
+    /// The same where windows take the map of empty machines, in units of it; none where there is no such map.
+    pub empty_gain: Vec<f64>,
     /// Rows that whiten a window, and what they make of the mean window; empty for the paper's recipe.
     pub whitening: Whitening,
     /// Layers as trained: the first one takes the whitened window.
@@ -244,7 +246,7 @@ impl Problem {
         }
         let structure = Structure::parse_any(&spec.structure, window, width)?;
         let output_steps = spec.output_steps.unwrap_or(1);
-        if output_steps > 1 && (structure.linear_skip || structure.form != Form::Dense) {
+        if output_steps > 1 && structure.form != Form::Dense {
             return Err(TrainError::SingleStep {
                 structure: structure.name,
             });
@@ -286,13 +288,12 @@ impl Problem {
         // The linear map uses every window even where the network gets the published few.
         let every = Windows::new(&train.series.run_rows, steps, WindowCut::Overlapping);
         let mut moments = WindowMoments::gather(&train.series, &every, &train.targets);
-        let noise_covariance = noise
-            .as_ref()
-            .map(|noise| noise.covariance(steps, &input_scaling));
-        if let Some(added) = &noise_covariance {
-            moments.add_noise(added);
+        if let Some(noise) = &noise {
+            moments.add_noise(&noise.covariance(steps, &input_scaling));
         }
         let calibration = calibration(data, &spec, steps, &noisy)?;
+        // The skip is the same map for every sample that is estimated, of the samples before it.
+        let skip_steps = steps + 1 - output_steps;
         let judge = WindowMoments::gather(&validation.series, &validation.windows, &validation.targets);
         let spectrum = Spectrum::new(&moments)?;
         let linear = spectrum.best_map(&moments, &judge);
@@ -312,13 +313,18 @@ impl Problem {
                 [Some(train), Some(judge)] => Some(Payloads { train, judge }),
                 _ => None,
             };
+            let [every, judged] = [&train, &validation]
+                .map(|part| Windows::new(&part.series.run_rows, skip_steps, WindowCut::Overlapping));
+            let covariance = noise
+                .as_ref()
+                .map(|noise| noise.covariance(skip_steps, &input_scaling));
             Some(Skip::fit(
                 sample(&train, &every),
-                sample(&validation, &validation.windows),
+                sample(&validation, &judged),
                 payloads,
                 &input_scaling,
                 &slow_inputs(&train_inputs),
-                noise_covariance.as_ref(),
+                covariance.as_ref(),
             )?)
         } else {
             None
@@ -328,10 +334,10 @@ impl Problem {
             train.series = Series::new(&seen, &input_scaling);
         }
         let errors =
-            [&train, &validation].map(|part| skip_errors(part, steps, skip.as_ref(), &input_scaling));
-        let wanted_scale = wanted_scale(&train, steps, skip.as_ref(), &errors[0]);
+            [&train, &validation].map(|part| skip_errors(part, skip_steps, skip.as_ref(), &input_scaling));
+        let (wanted_scale, empty_gain) = wanted_scale(&train, skip.as_ref(), &errors[0]);
         for (part, errors) in [&mut train, &mut validation].into_iter().zip(errors) {
-            part.wanted = in_units_of(&errors, &wanted_scale);
+            part.wanted = errors.in_units_of(&wanted_scale, &empty_gain);
         }
 
         let input_limits = if structure.linear_skip {
@@ -378,6 +384,7 @@ impl Problem {
             },
             structure,
             wanted_scale,
+            empty_gain,
             whitening,
             layers,
             parameters,
@@ -425,8 +432,9 @@ impl Problem {
             wanted: Vec::new(),
             targets: self.train.targets.clone(),
         };
-        let errors = skip_errors(&part, self.steps, self.skip.as_ref(), &self.input_scaling);
-        part.wanted = in_units_of(&errors, &self.wanted_scale);
+        let skip_steps = self.steps + 1 - self.output_steps;
+        let errors = skip_errors(&part, skip_steps, self.skip.as_ref(), &self.input_scaling);
+        part.wanted = errors.in_units_of(&self.wanted_scale, &self.empty_gain);
         Some(part)
     }
 }
@@ -552,57 +560,98 @@ fn input_limits(runs: &Runs) -> Vec<[f64; 2]> {
         .collect()
 }
 
-/// What the skip leaves over of the scaled targets, row by row; the targets themselves without one.
-/// Rows that end no window are 0 where there is a skip.
-fn skip_errors(part: &Part, steps: usize, skip: Option<&Skip>, scaling: &Scaling) -> Vec<f64> {
-    let Some(map) = skip else {
-        return part.targets.values.clone();
-    };
+/// What the skip leaves over of the scaled targets, row by row.
+struct LeftOver {
+    errors: Vec<f64>,
+    /// Whether the window that ends at each row took the map of empty machines.
+    is_empty: Vec<bool>,
+}
+
+/// Of a skip of so many samples; the targets themselves without one. Rows that no window estimates may be 0 where there is a skip.
+fn skip_errors(part: &Part, steps: usize, skip: Option<&Skip>, scaling: &Scaling) -> LeftOver {
     let width = part.targets.width;
+    let mut is_empty = vec![false; part.series.rows()];
+    let Some(map) = skip else {
+        return LeftOver {
+            errors: part.targets.values.clone(),
+            is_empty,
+        };
+    };
     let mut errors = vec![0.0; part.targets.values.len()];
-    let estimates: Vec<Vec<f64>> = (0..part.windows.len())
+    let windows = if steps == part.windows.steps {
+        part.windows.clone()
+    } else {
+        Windows::new(&part.series.run_rows, steps, WindowCut::Overlapping)
+    };
+    let estimates: Vec<(Vec<f64>, bool)> = (0..windows.len())
         .into_par_iter()
         .map(|index| {
             let mut estimate = vec![0.0; width];
-            let window = part.series.window(part.windows.first_row(index), steps);
-            map.apply(scaling, window, &mut estimate);
-            estimate
+            let window = part.series.window(windows.first_row(index), steps);
+            let is_empty = map.apply(scaling, window, &mut estimate);
+            (estimate, is_empty)
         })
         .collect();
-    for (index, estimate) in estimates.iter().enumerate() {
-        let row = part.windows.first_row(index) + steps - 1;
+    for (index, (estimate, took_empty)) in estimates.iter().enumerate() {
+        let row = windows.last_row(index);
+        is_empty[row] = *took_empty;
         for (t, value) in estimate.iter().enumerate() {
             errors[row * width + t] = part.targets.row(row)[t] - value;
         }
     }
-    errors
+    LeftOver { errors, is_empty }
 }
 
 /// Median size of what the skip leaves over on the training windows, per target; 1 without skip:
-/// rare windows with large errors do not set the scale of the others. A target that the skip explains to the last bit keeps a floor far below anything measurable.
-fn wanted_scale(part: &Part, steps: usize, skip: Option<&Skip>, errors: &[f64]) -> Vec<f64> {
+/// rare windows with large errors do not set the scale of the others. A target that the skip explains to the last bit keeps a floor far below anything
+/// measurable. Second, the same of windows that took the map of empty machines, in units of the first: what these maps leave over differs in size,
+/// and a network that learnt both in one unit would be as coarse for the one as for the other.
+fn wanted_scale(part: &Part, skip: Option<&Skip>, left: &LeftOver) -> (Vec<f64>, Vec<f64>) {
     const FLOOR: f64 = 1e-7;
     let width = part.targets.width;
-    if skip.is_none() {
-        return vec![1.0; width];
+    let Some(skip) = skip else {
+        return (vec![1.0; width], Vec::new());
+    };
+    let median = |rows: &[usize]| -> Vec<f64> {
+        (0..width)
+            .map(|t| {
+                let mut sizes: Vec<f64> = rows
+                    .iter()
+                    .map(|row| left.errors[row * width + t].abs())
+                    .collect();
+                quantile(&mut sizes, 0.5).max(FLOOR)
+            })
+            .collect()
+    };
+    let ends = (0..part.windows.len()).map(|index| part.windows.last_row(index));
+    let (empty, loaded): (Vec<usize>, Vec<usize>) = ends.partition(|&row| left.is_empty[row]);
+    let has_empty = skip.payload.as_ref().is_some_and(|p| p.empty.is_some());
+    if !has_empty || empty.is_empty() || loaded.is_empty() {
+        return (median(&[empty, loaded].concat()), Vec::new());
     }
-    (0..width)
-        .map(|t| {
-            let mut sizes: Vec<f64> = (0..part.windows.len())
-                .map(|index| part.windows.first_row(index) + steps - 1)
-                .map(|row| errors[row * width + t].abs())
-                .collect();
-            quantile(&mut sizes, 0.5).max(FLOOR)
-        })
-        .collect()
+    let scale = median(&loaded);
+    let gain = median(&empty).iter().zip(&scale).map(|(e, s)| e / s).collect();
+    (scale, gain)
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
-fn in_units_of(errors: &[f64], scale: &[f64]) -> Vec<f32> {
-    errors
-        .chunks(scale.len())
-        .flat_map(|row| row.iter().zip(scale).map(|(e, s)| (e / s) as f32))
-        .collect()
+impl LeftOver {
+    /// In the scale of each target, which is another one where the machine is empty.
+    #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]
+    fn in_units_of(&self, scale: &[f64], empty_gain: &[f64]) -> Vec<f32> {
+        let of_row = |(row, is_empty): (&[f64], &bool)| -> Vec<f32> {
+            let gain = |t: usize| {
+                if *is_empty {
+                    empty_gain.get(t).copied().unwrap_or(1.0)
+                } else {
+                    1.0
+                }
+            };
+            let units = row.iter().zip(scale).enumerate();
+            units.map(|(t, (e, s))| (e / (s * gain(t))) as f32).collect()
+        };
+        let rows = self.errors.chunks(scale.len()).zip(&self.is_empty);
+        rows.flat_map(of_row).collect()
+    }
 }
 
 #[allow(clippy::cast_possible_truncation, reason = "networks are f32")]

@@ -438,10 +438,10 @@ fn shape(spec: &JobSpec, training: &TrainingSpec, at: &impl Fn(&str) -> String, 
     errors.require(
         training
             .output_steps
-            .is_none_or(|steps| (1..=1000).contains(&steps) && (steps == 1 || structure != "best")),
+            .is_none_or(|steps| (1..=1000).contains(&steps)),
         at("output_steps"),
         training.output_steps,
-        "1 to 1000; above 1 for structures of letters",
+        "1 to 1000",
     );
     // Each of several estimated samples has the whole window before it.
     let window_steps = match training.window {
