@@ -300,11 +300,10 @@ pub fn predict_runs(model: &Model, runs: &Runs) -> PredictionTable {
             if let Some((lower, upper)) = &mut target.bounds {
                 for (bound, sign) in [(lower, -1.0), (upper, 1.0)] {
                     bound.extend(std::iter::repeat_n(None, blind));
-                    bound.extend(
-                        column
-                            .iter()
-                            .map(|&y| predictor.half_width(t, y).map(|half| y + sign * half)),
-                    );
+                    bound.extend(column.iter().enumerate().map(|(k, &y)| {
+                        let payload_kg = series.payload_kg.get(k).copied();
+                        predictor.half_width(t, y, payload_kg).map(|half| y + sign * half)
+                    }));
                 }
             }
         }

@@ -326,6 +326,19 @@ pub struct IntervalTable {
     pub upper_edges: Vec<f64>,
     /// Half widths, one per class, in the column's unit.
     pub half_widths: Vec<f64>,
+    /// Where the model follows a payload: what the half width is multiplied by.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub payload: Option<PayloadWidths>,
+}
+
+/// Factors of half widths in classes of the last estimate of the payload, that of the first class whose `upper_edge_kg` is at least the estimate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PayloadWidths {
+    /// Upper edges of the classes but the last, ascending, kg.
+    pub upper_edges_kg: Vec<f64>,
+    /// Factors, one per class.
+    pub factors: Vec<f64>,
 }
 
 /// Region of the training windows: a window is inside when every value is within the range of its channel

@@ -75,7 +75,7 @@ async fn a_recording_as_json_gives_estimates_with_intervals_flags_and_provenance
                 "{found} {}",
                 expected[target]
             );
-            let half = predictor.half_width(target, found).unwrap();
+            let half = predictor.half_width(target, found, None).unwrap();
             assert!((lower[&channel.name][window] - (found - half)).abs() < 1e-12 * channel.scale.max(1.0));
             assert!((upper[&channel.name][window] - (found + half)).abs() < 1e-12 * channel.scale.max(1.0));
         }

@@ -3,8 +3,11 @@
 //! Within a class the half width is the ⌈0.9 (n + 1)⌉-th smallest absolute error of the windows that
 //! calibrate. Errors grow with the estimate's distance from the mean, so a single width would cover
 //! small amplitudes too often and large ones too rarely.
+//!
+//! A network that follows a payload has errors that depend on it, an empty machine's a fraction of a loaded one's. There an
+//! error is first divided by that of its class of the estimated payload, and what is said above holds for the quotient.
 
-use hydroflex_openapi::model::IntervalTable;
+use hydroflex_openapi::model::{IntervalTable, PayloadWidths};
 
 /// Part of the true values inside, in tenths.
 const LEVEL_TENTHS: usize = 9;
@@ -13,6 +16,9 @@ const LEVEL_TENTHS: usize = 9;
 const CLASSES: std::ops::RangeInclusive<usize> = 3..=12;
 /// … which needs this many windows in each; neighbouring windows tell nearly the same.
 const FILLED_CLASS: usize = 2000;
+/// Most classes of payload, and windows for each.
+const PAYLOAD_CLASSES: usize = 24;
+const FILLED_PAYLOAD_CLASS: usize = 4000;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
 
@@ -46,7 +52,67 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
         centre,
         upper_edges,
         half_widths,
+        payload: None,
     })
+}
+
+/// As [`fit`] for a model that tells the payload of each window, kg.
+#[must_use]
+pub fn fit_by_payload(
+    estimate: &[f64],
+    reference: &[f64],
+    payload_kg: &[f64],
+    centre: f64,
+) -> Option<IntervalTable> {
+    let classes = (payload_kg.len() / FILLED_PAYLOAD_CLASS).clamp(1, PAYLOAD_CLASSES);
+    let mut order: Vec<usize> = (0..payload_kg.len()).collect();
+    order.sort_by(|a, b| payload_kg[*a].total_cmp(&payload_kg[*b]));
+    let mut widths = PayloadWidths {
+        upper_edges_kg: Vec::with_capacity(classes - 1),
+        factors: Vec::with_capacity(classes),
+    };
+    for class in 0..classes {
+        let (from, to) = (class * order.len() / classes, (class + 1) * order.len() / classes);
+        let mut errors: Vec<f64> = order[from..to]
+            .iter()
+            .map(|&window| (estimate[window] - reference[window]).abs())
+            .collect();
+        errors.sort_by(f64::total_cmp);
+        let width = errors.get(rank(errors.len()).checked_sub(1)?).copied()?;
+        widths.factors.push(width.max(f64::MIN_POSITIVE));
+        if class + 1 < classes {
+            widths.upper_edges_kg.push(payload_kg[order[to - 1]]);
+        }
+    }
+    // Every error in units of its class's.
+    let in_units: Vec<f64> = (0..estimate.len())
+        .map(|window| {
+            let unit = factor(&widths, payload_kg[window]);
+            estimate[window] + (reference[window] - estimate[window]) / unit
+        })
+        .collect();
+    let table = fit(estimate, &in_units, centre)?;
+    Some(IntervalTable {
+        payload: Some(widths),
+        ..table
+    })
+}
+
+/// Half width around an estimate; absent where a table has no class for it, or wants a payload and gets none.
+#[must_use]
+pub fn half_width(table: &IntervalTable, estimate: f64, payload_kg: Option<f64>) -> Option<f64> {
+    let distance = (estimate - table.centre).abs();
+    let class = table.upper_edges.partition_point(|&edge| edge < distance);
+    let factor = match &table.payload {
+        None => 1.0,
+        Some(widths) => factor(widths, payload_kg?),
+    };
+    table.half_widths.get(class).map(|half| half * factor)
+}
+
+fn factor(widths: &PayloadWidths, payload_kg: f64) -> f64 {
+    let class = widths.upper_edges_kg.partition_point(|&edge| edge < payload_kg);
+    widths.factors.get(class).copied().unwrap_or(f64::NAN)
 }
 
 /// ⌈0.9 (n + 1)⌉, at most n. In integers: a product that is whole must not be rounded up to the next.
@@ -65,6 +131,34 @@ mod tests {
             assert_eq!(rank(10 * tens - 1), 9 * tens);
             assert_eq!(rank(10 * tens), 9 * tens + 1);
         }
+    }
+
+    #[test]
+    fn payloads_with_other_errors_have_other_widths() {
+        // Four payloads, errors in proportion to each, amplitudes that say nothing about it.
+        let windows = 4 * 12_000_usize;
+        let payload_kg: Vec<f64> = (0..windows).map(|i| (1 + i % 4) as f64).collect();
+        let estimate: Vec<f64> = (0..windows).map(|i| (i as f64 * 0.7).sin()).collect();
+        let reference: Vec<f64> = (0..windows)
+            .map(|i| estimate[i] + 1e-3 * payload_kg[i] * (i as f64 * 1.3).sin())
+            .collect();
+        let part = |kg: f64, table: &IntervalTable| {
+            let of = (0..windows).filter(|&i| (payload_kg[i] - kg).abs() < 0.5);
+            let inside = of.clone().filter(|&i| {
+                (estimate[i] - reference[i]).abs()
+                    <= half_width(table, estimate[i], Some(payload_kg[i])).unwrap()
+            });
+            inside.count() as f64 / of.count() as f64
+        };
+        let table = fit_by_payload(&estimate, &reference, &payload_kg, 0.0).unwrap();
+        let plain = fit(&estimate, &reference, 0.0).unwrap();
+        for kg in [1.0, 2.0, 3.0, 4.0] {
+            let covered = part(kg, &table);
+            // Deterministic errors, spread evenly: within a class of amplitude a tenth is cut to the window.
+            assert!((covered - 0.9).abs() < 0.01, "{kg} kg: {covered}");
+        }
+        assert!(part(1.0, &plain) > 0.99 && part(4.0, &plain) < 0.8);
+        assert_eq!(half_width(&table, 0.0, None), None, "a payload is wanted");
     }
 
     #[test]

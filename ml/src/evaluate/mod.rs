@@ -57,6 +57,8 @@ pub struct RunEvaluation {
     pub reference: Vec<Vec<f64>>,
     /// The model's.
     pub estimate: Vec<Vec<f64>>,
+    /// Payload that the model told from each window, kg; empty when it follows none.
+    pub payload_kg: Vec<f64>,
     /// Least squares on the same windows.
     pub least_squares: Vec<Vec<f64>>,
 }
@@ -149,6 +151,7 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
                 .collect(),
             reference,
             estimate: series.columns,
+            payload_kg: series.payload_kg,
             least_squares,
         });
     }
@@ -167,12 +170,18 @@ pub fn evaluate(model: &Model, runs: &Runs, dataset_sha256: &str) -> Result<Eval
     };
     let mut of_model = judge(&all.estimate);
     if predictor.has_intervals() {
+        let payload_kg: Vec<f64> = (evaluated.iter())
+            .flat_map(|run| run.payload_kg.iter().copied())
+            .collect();
         for (t, metrics) in of_model.iter_mut().enumerate() {
             let coverage = coverage(
                 &all.estimate[t],
                 &all.reference[t],
                 config.targets[t].offset,
-                |estimate| predictor.half_width(t, estimate).unwrap_or(0.0),
+                |window, estimate| {
+                    let half = predictor.half_width(t, estimate, payload_kg.get(window).copied());
+                    half.unwrap_or(0.0)
+                },
             );
             metrics.coverage = Some(coverage.all);
             metrics.coverage_thirds = Some(coverage.thirds);
@@ -214,14 +223,20 @@ struct Coverage {
 }
 
 /// Part of the reference values within the half width of their estimates, all and by thirds of their distance from
-/// `centre`, and the mean width.
-fn coverage(estimate: &[f64], reference: &[f64], centre: f64, half_width: impl Fn(f64) -> f64) -> Coverage {
+/// `centre`, and the mean width. `half_width`: of a window by its number and estimate.
+fn coverage(
+    estimate: &[f64],
+    reference: &[f64],
+    centre: f64,
+    half_width: impl Fn(usize, f64) -> f64,
+) -> Coverage {
     let mut width = 0.0;
     let mut samples: Vec<(f64, bool)> = estimate
         .iter()
         .zip(reference)
-        .map(|(&e, &r)| {
-            let half = half_width(e);
+        .enumerate()
+        .map(|(window, (&e, &r))| {
+            let half = half_width(window, e);
             width += 2.0 * half;
             ((r - centre).abs(), (e - r).abs() <= half)
         })

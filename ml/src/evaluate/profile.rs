@@ -231,6 +231,7 @@ mod tests {
                 time_s,
                 reference: vec![reference],
                 estimate: vec![estimate],
+                payload_kg: Vec::new(),
                 least_squares: vec![least_squares],
             }],
         }

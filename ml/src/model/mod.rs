@@ -342,6 +342,15 @@ fn read_config(path: &Path) -> Result<ModelConfig, ModelError> {
             "the bounds of the estimates must be ordered, one set per target",
         ));
     }
+    let payload_widths = config.intervals.iter().filter_map(|table| table.payload.as_ref());
+    if payload_widths
+        .clone()
+        .any(|widths| config.payload.is_none() || widths.factors.len() != widths.upper_edges_kg.len() + 1)
+    {
+        return Err(inconsistent(
+            "intervals that follow the payload need a model that does, and a factor per class",
+        ));
+    }
     let scales = config.inputs.iter().chain(&config.targets);
     if scales
         .clone()

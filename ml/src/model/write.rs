@@ -463,7 +463,7 @@ fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
             linear[t].push(scaling.unscale(t, row[t]));
         }
     }
-    let estimates = estimates(&problem.validation_inputs, predictor);
+    let (estimates, _) = estimates(&problem.validation_inputs, predictor);
     let judge = |estimate: &[Vec<f64>]| -> Vec<TargetMetrics> {
         scaling
             .channels()
@@ -475,10 +475,13 @@ fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
             .collect()
     };
     let (mut estimated, mut truth) = (vec![Vec::new(); targets], vec![Vec::new(); targets]);
+    let mut payload_kg = Vec::new();
     for (inputs, wanted) in &problem.calibration {
-        for (all, part) in estimated.iter_mut().zip(self::estimates(inputs, predictor)) {
+        let (of_windows, payloads) = self::estimates(inputs, predictor);
+        for (all, part) in estimated.iter_mut().zip(of_windows) {
             all.extend(part);
         }
+        payload_kg.extend(payloads);
         for run in &wanted.runs {
             for (all, column) in truth.iter_mut().zip(&run.columns) {
                 all.extend(column.iter().skip(problem.steps - 1));
@@ -489,7 +492,13 @@ fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
         .iter()
         .zip(&truth)
         .zip(scaling.channels())
-        .filter_map(|((e, r), channel)| evaluate::intervals::fit(e, r, channel.offset))
+        .filter_map(|((e, r), channel)| {
+            if predictor.follows_payload() {
+                evaluate::intervals::fit_by_payload(e, r, &payload_kg, channel.offset)
+            } else {
+                evaluate::intervals::fit(e, r, channel.offset)
+            }
+        })
         .collect::<Vec<_>>();
     Judged {
         network: judge(&estimates),
@@ -502,9 +511,10 @@ fn judge(problem: &Problem, predictor: &Predictor) -> Judged {
     }
 }
 
-/// Estimates at the ends of all windows of some runs, run after run, one column per target.
-fn estimates(inputs: &Runs, predictor: &Predictor) -> Vec<Vec<f64>> {
+/// Estimates at the ends of all windows of some runs, run after run, one column per target, and the payload of each window, kg, where it is followed.
+fn estimates(inputs: &Runs, predictor: &Predictor) -> (Vec<Vec<f64>>, Vec<f64>) {
     let mut estimates = vec![Vec::new(); predictor.target_count()];
+    let mut payload_kg = Vec::new();
     let mut workspace = predictor.workspace();
     for run in &inputs.runs {
         let columns: Vec<&[f64]> = run.columns.iter().map(Vec::as_slice).collect();
@@ -512,8 +522,9 @@ fn estimates(inputs: &Runs, predictor: &Predictor) -> Vec<Vec<f64>> {
         for (all, column) in estimates.iter_mut().zip(series.columns) {
             all.extend(column);
         }
+        payload_kg.extend(series.payload_kg);
     }
-    estimates
+    (estimates, payload_kg)
 }
 
 /// Windows spread over the validation runs.

@@ -105,7 +105,11 @@ pub fn of_run(
             let scaled = |values: &[f64]| -> Vec<f64> { values.iter().map(|v| v * factor).collect() };
             let half_width = evaluated.estimate[t]
                 .iter()
-                .map(|&e| predictor.half_width(t, e).map(|h| h * factor))
+                .enumerate()
+                .map(|(k, &e)| {
+                    let payload_kg = evaluated.payload_kg.get(k).copied();
+                    predictor.half_width(t, e, payload_kg).map(|h| h * factor)
+                })
                 .collect();
             PictureRow {
                 name: readable(&channel.name),

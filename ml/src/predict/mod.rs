@@ -13,6 +13,7 @@ pub mod guard;
 pub mod sliding;
 pub mod synthetic;
 
+use crate::evaluate::intervals;
 use crate::model::weights::{Auxiliary, LinearWeights, Weights};
 use crate::scaling::Scaling;
 use guard::GuardKernel;
@@ -87,6 +88,8 @@ pub struct Workspace {
     guide: Vec<f32>,
     /// Whether the guard changed an estimate of each window of the last block.
     limited: Vec<bool>,
+    /// Payload of each window of the last block, kg; empty where none is followed.
+    payload_kg: Vec<f64>,
     projected: Vec<f32>,
 }
 
@@ -99,6 +102,17 @@ pub struct SeriesEstimates {
     pub columns: Vec<Vec<f64>>,
     /// Whether the window is inside the model's envelope; empty when it has none.
     pub inside: Vec<bool>,
+    /// Payload that the model told from the window, kg; empty when it follows none.
+    pub payload_kg: Vec<f64>,
+}
+
+/// What is asked for beside the estimates, one place per window.
+#[derive(Debug, Default)]
+pub struct PerWindow<'a> {
+    /// Whether it is inside the envelope; every window is when the model has none.
+    pub inside: Option<&'a mut [bool]>,
+    /// Payload that the model told from it, kg; NaN when it follows none.
+    pub payload_kg: Option<&'a mut [f64]>,
 }
 
 /// Mean square of the coordinates of each group.
@@ -113,6 +127,13 @@ pub fn group_squares<'a>(
         let sum: f64 = head.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
         sum / group.components.max(1) as f64
     })
+}
+
+/// Payloads of the first `count` windows.
+fn note(payload_kg: &mut [f64], found: impl Iterator<Item = f64>, count: usize) {
+    for (slot, kg) in payload_kg.iter_mut().zip(found.take(count)) {
+        *slot = kg;
+    }
 }
 
 /// Layers with nothing between them are one linear map: `W₂ (W₁ x + b₁) + b₂ = (W₂ W₁) x + (W₂ b₁ + b₂)`,
@@ -274,6 +295,12 @@ impl Predictor {
         self.envelope.is_some()
     }
 
+    /// Whether the model tells the payload from the window, and its linear part follows it.
+    #[must_use]
+    pub fn follows_payload(&self) -> bool {
+        self.skip.as_ref().is_some_and(Skip::follows_payload)
+    }
+
     /// Whether estimates come with intervals.
     #[must_use]
     pub fn has_intervals(&self) -> bool {
@@ -348,6 +375,7 @@ impl Predictor {
             skip: vec![0.0; ROWS * skip],
             guide: vec![0.0; ROWS * self.guard.as_ref().map_or(0, GuardKernel::padded)],
             limited: vec![false; ROWS],
+            payload_kg: vec![0.0; if self.follows_payload() { ROWS } else { 0 }],
             projected: vec![0.0; ROWS * projected],
         }
     }
@@ -368,11 +396,10 @@ impl Predictor {
     /// # Panics
     /// When a slice has another length.
     pub fn predict_windows<T: Sample>(&self, windows: &[T], out: &mut [f64], workspace: &mut Workspace) {
-        self.predict_windows_with(windows, out, None, workspace);
+        self.predict_windows_with(windows, out, PerWindow::default(), workspace);
     }
 
-    /// As [`Self::predict_windows`], and for each window whether it is inside the envelope, if
-    /// asked for; every window is inside when the model has none.
+    /// As [`Self::predict_windows`], and for each window what `asked` has room for.
     ///
     /// # Panics
     /// When a slice has another length.
@@ -380,17 +407,22 @@ impl Predictor {
         &self,
         windows: &[T],
         out: &mut [f64],
-        mut inside: Option<&mut [bool]>,
+        asked: PerWindow<'_>,
         workspace: &mut Workspace,
     ) {
+        let PerWindow {
+            mut inside,
+            mut payload_kg,
+        } = asked;
         let size = self.window_len();
         let targets = self.targets.len();
         assert_eq!(windows.len() % size, 0, "whole windows");
         let count = windows.len() / size;
         assert_eq!(out.len(), count * targets, "one row of estimates per window");
         assert!(
-            inside.as_ref().is_none_or(|inside| inside.len() == count),
-            "one flag per window"
+            inside.as_ref().is_none_or(|inside| inside.len() == count)
+                && payload_kg.as_ref().is_none_or(|kg| kg.len() == count),
+            "one flag and payload per window"
         );
         let mut scaled = std::mem::take(&mut workspace.window);
         for (block, samples) in windows.chunks(ROWS * size).enumerate() {
@@ -407,6 +439,11 @@ impl Predictor {
                 &mut out[first * targets..(first + rows) * targets],
                 workspace,
             );
+            if let Some(payload_kg) = payload_kg.as_deref_mut() {
+                let found = workspace.payload_kg.iter().copied();
+                let found = found.chain(std::iter::repeat(f64::NAN));
+                (payload_kg[first..first + rows].iter_mut().zip(found)).for_each(|(kg, found)| *kg = found);
+            }
             if let Some(inside) = inside.as_deref_mut() {
                 let inside = &mut inside[first..first + rows];
                 self.inside_block(arranged, rows, inside, workspace);
@@ -467,6 +504,7 @@ impl Predictor {
         let targets = self.targets.len();
         let mut estimates = vec![Vec::with_capacity(count); targets];
         let mut inside = vec![true; if self.envelope.is_some() { count } else { 0 }];
+        let mut payload_kg = Vec::with_capacity(if self.follows_payload() { count } else { 0 });
         // Column by column, where a value of neighbouring windows is a slice, with room to read a
         // whole panel at the end; a few windows row by row.
         let (between_rows, between_columns) = if count < MANY {
@@ -497,6 +535,7 @@ impl Predictor {
                     column.push(self.targets.unscale(t, f64::from(value)));
                 }
             }
+            payload_kg.extend(workspace.payload_kg.iter().take(block));
             if !inside.is_empty() {
                 self.inside_block(windows, block, &mut inside[first..first + block], workspace);
             }
@@ -506,16 +545,15 @@ impl Predictor {
             first_row: self.steps - 1,
             columns: estimates,
             inside,
+            payload_kg,
         }
     }
 
-    /// Half width of the 90 % interval around an estimate; absent when the model has none.
+    /// Half width of the 90 % interval around an estimate, with the payload of its window where the model follows one; absent when the model
+    /// has none.
     #[must_use]
-    pub fn half_width(&self, target: usize, estimate: f64) -> Option<f64> {
-        let table = self.intervals.get(target)?;
-        let distance = (estimate - table.centre).abs();
-        let class = table.upper_edges.partition_point(|&edge| edge < distance);
-        table.half_widths.get(class).copied()
+    pub fn half_width(&self, target: usize, estimate: f64, payload_kg: Option<f64>) -> Option<f64> {
+        intervals::half_width(self.intervals.get(target)?, estimate, payload_kg)
     }
 
     /// Estimates for at most [`ROWS`] windows, or [`PANEL`] side by side, one row of scaled targets per window in
@@ -530,6 +568,7 @@ impl Predictor {
             skip,
             guide,
             limited,
+            payload_kg,
             ..
         } = workspace;
         let scaled = &mut scaled[..rows * targets];
@@ -556,12 +595,15 @@ impl Predictor {
                     let x = &x[self.skip_from..];
                     if kernel.is_narrow() || rows < MANY {
                         kernel.add(x, stride, rows, skip, scaled);
+                        note(payload_kg, kernel.payloads_kg(skip), rows);
                     } else {
                         for first in (0..rows).step_by(PANEL) {
                             let (x, columns) = (&x[first * stride..], PANEL.min(rows - first));
                             panel::transpose(x, stride, columns, self.window_len() - self.skip_from, panel);
                             let scaled = &mut scaled[first * targets..(first + columns) * targets];
                             kernel.add_panel(panel, &self.places, columns, skip, scaled);
+                            let found = kernel.payloads_kg(skip);
+                            note(payload_kg.get_mut(first..).unwrap_or(&mut []), found, columns);
                         }
                     }
                 }
@@ -586,6 +628,7 @@ impl Predictor {
                 }
                 if let Some(kernel) = &self.skip {
                     kernel.add_panel(x, &places[self.skip_from..], rows, skip, scaled);
+                    note(payload_kg, kernel.payloads_kg(skip), rows);
                 }
                 if let Some(kernel) = &self.guard {
                     kernel.limit_panel(x, places, rows, guide, scaled, limited);

@@ -51,6 +51,8 @@ pub struct SkipKernel {
 /// Skip connections whose coefficients follow an estimate of the payload, see [`crate::payload`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct FollowingKernel {
+    /// Middle and half of the payload's range, kg.
+    range_kg: [f64; 2],
     /// Of the estimate, first to last: one target each.
     estimates: Vec<SkipKernel>,
     empty: Option<EmptyKernel>,
@@ -82,6 +84,7 @@ impl Skip {
         let targets = config.targets.len();
         let map = kernel(weights.skip.as_ref()?, config.schedule.as_ref(), targets);
         let payload = config.payload.as_ref().map(|payload| FollowingKernel {
+            range_kg: [payload.centre_kg, payload.half_range_kg],
             estimates: payload
                 .estimates
                 .iter()
@@ -113,6 +116,21 @@ impl Skip {
         // The estimate, and the sums of one map after the other.
         let widest = self.maps().map(SkipKernel::padded).max().unwrap_or(0);
         widest + usize::from(self.payload.is_some())
+    }
+
+    /// Whether the coefficients follow a payload.
+    #[must_use]
+    pub fn follows_payload(&self) -> bool {
+        self.payload.is_some()
+    }
+
+    /// Payloads, kg, that [`Self::add`] or [`Self::add_panel`] found last, from its scratch memory; nothing where none is followed.
+    pub fn payloads_kg<'a>(&'a self, scratch: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
+        let of = |payload: &'a FollowingKernel| {
+            let [centre, half] = payload.range_kg;
+            scratch.iter().map(move |estimate| centre + half * estimate)
+        };
+        self.payload.iter().flat_map(of)
     }
 
     /// Whether windows that are rows need not be turned into a panel, however many there are.

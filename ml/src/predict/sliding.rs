@@ -19,6 +19,15 @@ pub struct SlidingWindow {
     held: usize,
 }
 
+/// What a window shows beside the estimates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Found {
+    /// Whether it is inside the envelope; true when the model has none.
+    pub inside: bool,
+    /// The payload that the model told from it, kg, where it follows one.
+    pub payload_kg: Option<f64>,
+}
+
 impl SlidingWindow {
     /// An empty window for a model.
     #[must_use]
@@ -93,12 +102,17 @@ impl SlidingWindow {
         self.in_range[row] = predictor.maps.in_range(sample);
     }
 
-    /// Estimates for the window in the columns' units, and whether it is inside the envelope.
+    /// Estimates for the window in the columns' units, whether it is inside the envelope, and the payload that it tells.
     /// Without a whole window nothing is estimated.
     ///
     /// # Panics
     /// When `out` has not one place per target.
-    pub fn predict(&self, predictor: &Predictor, out: &mut [f64], workspace: &mut Workspace) -> Option<bool> {
+    pub fn predict(
+        &self,
+        predictor: &Predictor,
+        out: &mut [f64],
+        workspace: &mut Workspace,
+    ) -> Option<Found> {
         if !self.is_full() {
             return None;
         }
@@ -112,6 +126,9 @@ impl SlidingWindow {
         predictor.unscale(1, out, workspace);
         let mut inside = [true];
         predictor.inside_block(windows, 1, &mut inside, workspace);
-        Some(inside[0] && self.in_range.iter().all(|&in_range| in_range))
+        Some(Found {
+            inside: inside[0] && self.in_range.iter().all(|&in_range| in_range),
+            payload_kg: workspace.payload_kg.first().copied(),
+        })
     }
 }

@@ -240,6 +240,7 @@ fn config(spec: &SyntheticSpec, linear_skip: bool, layers: &[DenseLayer]) -> Mod
 mod tests {
     use super::super::sliding::SlidingWindow;
     use super::*;
+    use crate::predict::PerWindow;
     use hydroflex_openapi::model::{EmptyMachine, FollowedPayload, Schedule};
 
     fn model(structure: &str) -> SyntheticModel {
@@ -295,8 +296,9 @@ mod tests {
 
     #[test]
     fn a_sliding_window_estimates_what_a_recording_gives() {
-        for structure in ["best", "RLR", "TLTLT"] {
-            let predictor = model(structure).predictor();
+        let models = ["best", "RLR", "TLTLT"].map(|structure| (structure, model(structure)));
+        for (structure, model) in models.into_iter().chain([("following", following())]) {
+            let predictor = model.predictor();
             let rows = 40;
             let samples = signal(0, rows);
             let columns: Vec<Vec<f64>> = (0..5)
@@ -309,11 +311,15 @@ mod tests {
             let mut out = [0.0; 3];
             for (row, sample) in samples.chunks(5).enumerate() {
                 window.push(&predictor, sample);
-                let inside = window.predict(&predictor, &mut out, &mut workspace);
+                let found = window.predict(&predictor, &mut out, &mut workspace);
                 match row.checked_sub(series.first_row) {
-                    None => assert_eq!(inside, None, "row {row}"),
+                    None => assert_eq!(found, None, "row {row}"),
                     Some(k) => {
-                        assert_eq!(inside, Some(series.inside[k]));
+                        let found = found.unwrap();
+                        assert_eq!(found.inside, series.inside[k]);
+                        let payload_kg = series.payload_kg.get(k).copied();
+                        assert_eq!(found.payload_kg, payload_kg, "{structure} row {row}");
+                        assert_eq!(found.payload_kg.is_some(), structure == "following");
                         for (t, value) in out.iter().enumerate() {
                             // The same bits, however many windows are estimated at once.
                             assert_eq!(
@@ -486,19 +492,32 @@ mod tests {
             let mut workspace = predictor.workspace();
             let samples = signal(0, 12 * 130);
             let mut alone = vec![0.0; 130 * 3];
-            for (window, out) in samples.chunks(60).zip(alone.chunks_mut(3)) {
-                predictor.predict_window(window, out, &mut workspace);
+            let mut payload_alone = vec![0.0; 130];
+            let places = alone.chunks_mut(3).zip(payload_alone.chunks_mut(1));
+            for (window, (out, payload_kg)) in samples.chunks(60).zip(places) {
+                let asked = PerWindow {
+                    payload_kg: Some(payload_kg),
+                    ..PerWindow::default()
+                };
+                predictor.predict_windows_with(window, out, asked, &mut workspace);
             }
+            let bits = |values: &[f64]| -> Vec<u64> { values.iter().map(|v| v.to_bits()).collect() };
+            assert_eq!(payload_alone[0].is_nan(), !predictor.follows_payload());
             for count in [2, 7, 8, 16, 33, 45, 48, 49, 130] {
                 let mut together = vec![0.0; count * 3];
                 let mut inside = vec![false; count];
+                let mut payload_kg = vec![0.0; count];
                 predictor.predict_windows_with(
                     &samples[..count * 60],
                     &mut together,
-                    Some(&mut inside),
+                    PerWindow {
+                        inside: Some(&mut inside),
+                        payload_kg: Some(&mut payload_kg),
+                    },
                     &mut workspace,
                 );
                 assert_eq!(together, alone[..count * 3], "model {number}, {count} windows");
+                assert_eq!(bits(&payload_kg), bits(&payload_alone[..count]), "model {number}");
                 assert!(inside.iter().all(|inside| *inside));
             }
             // The same windows, overlapping: those of a recording.
@@ -508,6 +527,9 @@ mod tests {
             let columns: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
             let series = predictor.predict_series_with(&columns, &mut workspace);
             for (window, row) in alone.chunks(3).enumerate() {
+                if let Some(found) = series.payload_kg.get(12 * window) {
+                    assert_eq!(found.to_bits(), payload_alone[window].to_bits());
+                }
                 for (target, value) in row.iter().enumerate() {
                     let found = series.columns[target][12 * window];
                     assert_eq!(value.to_bits(), found.to_bits(), "model {number}");
@@ -587,8 +609,15 @@ mod tests {
                 let Some(k) = row.checked_sub(11) else { continue };
                 let window = &samples[k * 5..(k + 12) * 5];
                 let (mut single, mut flag) = ([0.0; 3], [true]);
-                predictor.predict_windows_with(window, &mut single, Some(&mut flag), &mut workspace);
-                assert_eq!((Some(flag[0]), flag[0]), (inside, series.inside[k]));
+                let asked = PerWindow {
+                    inside: Some(&mut flag),
+                    ..PerWindow::default()
+                };
+                predictor.predict_windows_with(window, &mut single, asked, &mut workspace);
+                assert_eq!(
+                    (Some(flag[0]), flag[0]),
+                    (inside.map(|found| found.inside), series.inside[k])
+                );
                 for (t, channel) in model.config.targets.iter().enumerate() {
                     let scaled = |(i, v): (usize, &f64)| (v - INPUTS[i % 5].2) / INPUTS[i % 5].3;
                     let sum: f64 = guide.weight[t * 60..(t + 1) * 60]
@@ -651,7 +680,8 @@ mod tests {
                 sample[3] = 1e9;
             }
             window.push(&predictor, &sample);
-            flags.push(window.predict(&predictor, &mut [0.0; 3], &mut workspace));
+            let found = window.predict(&predictor, &mut [0.0; 3], &mut workspace);
+            flags.push(found.map(|found| found.inside));
         }
         assert_eq!(flags[19], Some(true));
         assert!(flags[20..32].iter().all(|flag| *flag == Some(false)), "{flags:?}");
@@ -659,7 +689,11 @@ mod tests {
         let mut batch = [true; 1];
         let mut outlier = samples[..60].to_vec();
         outlier[13] = 1e9;
-        predictor.predict_windows_with(&outlier, &mut [0.0; 3], Some(&mut batch), &mut workspace);
+        let asked = PerWindow {
+            inside: Some(&mut batch),
+            ..PerWindow::default()
+        };
+        predictor.predict_windows_with(&outlier, &mut [0.0; 3], asked, &mut workspace);
         assert_eq!(batch, [false]);
     }
 }

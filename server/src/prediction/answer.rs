@@ -25,8 +25,11 @@ impl LoadedModel {
         let bound = |sign: f64| {
             predictor.has_intervals().then(|| {
                 let columns = series.columns.iter().enumerate().map(|(target, column)| {
-                    let half = |y: &f64| predictor.half_width(target, *y).unwrap_or(f64::NAN);
-                    column.iter().map(|y| y + sign * half(y)).collect()
+                    let half = |(k, y): (usize, &f64)| {
+                        let payload_kg = series.payload_kg.get(k).copied();
+                        y + sign * predictor.half_width(target, *y, payload_kg).unwrap_or(f64::NAN)
+                    };
+                    column.iter().enumerate().map(half).collect()
                 });
                 named(columns.collect())
             })

@@ -4,7 +4,7 @@
 //! order in which the JSON names them. Everything is checked before anything is computed.
 
 use super::{LoadedModel, numbers};
-use hydroflex_ml::predict::Predictor;
+use hydroflex_ml::predict::{PerWindow, Predictor};
 use hydroflex_openapi::model::ModelConfig;
 use serde::de::{Deserializer, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
@@ -503,6 +503,38 @@ fn check_finite(name: &str, numbers: &[f64], targets: usize) -> Result<(), Strin
     }
 }
 
+/// What a model gives for a batch, window by window.
+struct Estimated {
+    estimates: Vec<f64>,
+    /// Empty unless it was asked for.
+    inside: Vec<bool>,
+    /// Where bounds follow a payload; else empty.
+    payload_kg: Vec<f64>,
+}
+
+fn estimate(model: &LoadedModel, batch: &Batch, wants_inside: bool, wants_bounds: bool) -> Estimated {
+    let predictor = model.predictor();
+    let follows = predictor.follows_payload() && wants_bounds;
+    let mut found = Estimated {
+        estimates: vec![0.0; batch.windows * predictor.target_count()],
+        inside: vec![true; if wants_inside { batch.windows } else { 0 }],
+        payload_kg: vec![0.0; if follows { batch.windows } else { 0 }],
+    };
+    let asked = PerWindow {
+        inside: wants_inside.then_some(found.inside.as_mut_slice()),
+        payload_kg: follows.then_some(found.payload_kg.as_mut_slice()),
+    };
+    model.with_workspace(|workspace| match &batch.samples {
+        Samples::Single(values) => {
+            predictor.predict_windows_with(values, &mut found.estimates, asked, workspace);
+        }
+        Samples::Double(values) => {
+            predictor.predict_windows_with(values, &mut found.estimates, asked, workspace);
+        }
+    });
+    found
+}
+
 /// Estimates for a checked batch.
 ///
 /// # Errors
@@ -511,31 +543,23 @@ pub fn answer(model: &LoadedModel, name: &str, version: &str, batch: &Batch) -> 
     let predictor = model.predictor();
     let targets = predictor.target_count();
     let wants = |output| batch.outputs.iter().any(|(wanted, _)| *wanted == output);
-    let mut estimates = vec![0.0; batch.windows * targets];
-    let mut inside = vec![
-        true;
-        if wants(Output::InsideEnvelope) {
-            batch.windows
-        } else {
-            0
-        }
-    ];
-    model.with_workspace(|workspace| {
-        let flags = (!inside.is_empty()).then_some(inside.as_mut_slice());
-        match &batch.samples {
-            Samples::Single(values) => {
-                predictor.predict_windows_with(values, &mut estimates, flags, workspace);
-            }
-            Samples::Double(values) => {
-                predictor.predict_windows_with(values, &mut estimates, flags, workspace);
-            }
-        }
-    });
+    let wants_bounds = wants(Output::Lower) || wants(Output::Upper);
+    let Estimated {
+        estimates,
+        inside,
+        payload_kg,
+    } = estimate(model, batch, wants(Output::InsideEnvelope), wants_bounds);
     let bound = |sign: f64| -> Vec<f64> {
         estimates
             .iter()
             .enumerate()
-            .map(|(place, y)| y + sign * predictor.half_width(place % targets, *y).unwrap_or(f64::NAN))
+            .map(|(place, y)| {
+                let payload_kg = payload_kg.get(place / targets).copied();
+                y + sign
+                    * predictor
+                        .half_width(place % targets, *y, payload_kg)
+                        .unwrap_or(f64::NAN)
+            })
             .collect()
     };
     let lower = if wants(Output::Lower) {

@@ -38,6 +38,8 @@ pub struct Session {
     estimates: Vec<f64>,
     /// Of the last estimate; `None` when there was none.
     inside: Option<bool>,
+    /// Payload that the model told from the last window, kg.
+    payload_kg: Option<f64>,
     has_estimate: bool,
 }
 
@@ -68,6 +70,7 @@ impl Session {
             between: vec![0.0; predictor.input_count()],
             estimates: vec![0.0; predictor.target_count()],
             inside: None,
+            payload_kg: None,
             has_estimate: false,
             model,
         }
@@ -130,8 +133,14 @@ impl Session {
                 .collect()
         };
         let bound = |sign: f64| {
-            (taken.has_estimate && predictor.has_intervals())
-                .then(|| named(&|target, y| y + sign * predictor.half_width(target, y).unwrap_or(f64::NAN)))
+            (taken.has_estimate && predictor.has_intervals()).then(|| {
+                named(&|target, y| {
+                    y + sign
+                        * predictor
+                            .half_width(target, y, self.payload_kg)
+                            .unwrap_or(f64::NAN)
+                })
+            })
         };
         Ok(StreamEstimate {
             step: taken.step,
@@ -183,7 +192,9 @@ impl Session {
         answer.extend([0; 4]);
         for (target, &y) in self.estimates.iter().enumerate() {
             let values = if taken.has_estimate {
-                let half = predictor.half_width(target, y).unwrap_or(f64::NAN);
+                let half = predictor
+                    .half_width(target, y, self.payload_kg)
+                    .unwrap_or(f64::NAN);
                 [y, y - half, y + half]
             } else {
                 [f64::NAN; 3]
@@ -248,10 +259,13 @@ impl Session {
         if self.has_estimate {
             let predictor = self.model.predictor();
             let (window, estimates) = (&self.window, &mut self.estimates);
-            let inside = self
+            let found = self
                 .model
                 .with_workspace(|workspace| window.predict(predictor, estimates, workspace));
-            self.inside = inside.filter(|_| predictor.has_envelope());
+            self.inside = found
+                .map(|found| found.inside)
+                .filter(|_| predictor.has_envelope());
+            self.payload_kg = found.and_then(|found| found.payload_kg);
         }
         Taken {
             step,

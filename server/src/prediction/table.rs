@@ -326,6 +326,7 @@ impl<'m> Estimator<'m> {
         let keep = predictor.window_steps() - 1;
         let mut estimates: Vec<Vec<Option<f64>>> = vec![Vec::with_capacity(rows.count); targets];
         let mut inside: Vec<Option<bool>> = Vec::with_capacity(rows.count);
+        let mut payload_kg: Vec<Option<f64>> = Vec::new();
         let mut first = 0;
         for &(end, goes_on) in &rows.segments {
             if !goes_on {
@@ -340,6 +341,10 @@ impl<'m> Estimator<'m> {
                 .with_workspace(|workspace| predictor.predict_series_with(&views, workspace));
             let found = series.columns.first().map_or(0, Vec::len);
             let blind = end - first - found;
+            if predictor.follows_payload() {
+                payload_kg.extend(std::iter::repeat_n(None, blind));
+                payload_kg.extend(series.payload_kg.into_iter().map(Some));
+            }
             for (all, column) in estimates.iter_mut().zip(series.columns) {
                 all.extend(std::iter::repeat_n(None, blind));
                 all.extend(column.into_iter().map(Some));
@@ -360,9 +365,13 @@ impl<'m> Estimator<'m> {
         columns.extend(rows.time_s.map(|column| Arc::new(column) as ArrayRef));
         for (target, values) in estimates.into_iter().enumerate() {
             let bound = |sign: f64| -> ArrayRef {
-                let ends = values
-                    .iter()
-                    .map(|y| y.and_then(|y| predictor.half_width(target, y).map(|half| y + sign * half)));
+                let ends = values.iter().enumerate().map(|(row, y)| {
+                    let y = (*y)?;
+                    let payload_kg = payload_kg.get(row).copied().flatten();
+                    predictor
+                        .half_width(target, y, payload_kg)
+                        .map(|half| y + sign * half)
+                });
                 Arc::new(ends.collect::<Float64Array>())
             };
             let bounds = predictor.has_intervals().then(|| [bound(-1.0), bound(1.0)]);
