@@ -27,8 +27,11 @@ const CYCLE_ANGLE_DEG: f64 = 18.24;
 /// within stroke and pressures. Intervals, envelope and faults take all that do.
 const RANDOM_CANDIDATES: u64 = 40;
 const CANDIDATES_PER_SIGNAL: u64 = 8;
-/// Random 10 s runs of which those without a flag calibrate.
+/// Random 10 s runs of which those without a flag calibrate: at least, for each one whose errors are reported (who judges by more runs
+/// sees what calibration on few leaves to chance), and at most.
 const CALIBRATION_CANDIDATES: u64 = 1024;
+const CALIBRATION_PER_SIGNAL: u64 = 40;
+const MOST_CALIBRATION_CANDIDATES: u64 = 4096;
 /// Added to the study's seed for the calibration runs.
 const CALIBRATION_SEED: u64 = 2_000_003;
 /// Part of the runs with random payloads from 0 kg on that carry exactly nothing.
@@ -94,7 +97,7 @@ impl Sets {
         let spec = job(
             args,
             payload,
-            CALIBRATION_CANDIDATES,
+            calibration_candidates(args.signals),
             EVALUATION_S,
             CALIBRATION_SEED,
         )?;
@@ -112,6 +115,10 @@ impl Sets {
             folder,
         })
     }
+}
+
+fn calibration_candidates(signals: u64) -> u64 {
+    (CALIBRATION_PER_SIGNAL * signals).clamp(CALIBRATION_CANDIDATES, MOST_CALIBRATION_CANDIDATES)
 }
 
 fn job(args: &Args, payload: Payload, runs: u64, duration_s: f64, seed: u64) -> anyhow::Result<JobSpec> {
