@@ -33,7 +33,10 @@ if ! $rust_only; then
     venv=target/test-venv
     if [ ! -x "$venv/bin/python" ]; then python3 -m venv "$venv"; fi
     # Not the pip script: it names the place where the environment was made, which a copy is not.
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+    install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt; }
+    install
+    # The programs that came with the packages name that place too: a copy is made anew.
+    if ! "$venv/bin/moto_server" --help >/dev/null 2>&1; then python3 -m venv --clear "$venv" && install; fi
     # An S3 server for the Rust tests.
     export HYDROFLEX_MOTO="$PWD/$venv/bin/moto_server"
 fi
