@@ -465,6 +465,12 @@ fn a_model_card_shows_how_the_data_lie_and_how_the_network_learned() {
     assert_eq!(text("learning.svg").matches("<polyline").count(), 2);
 }
 
+/// Why a training with this specification is not begun.
+fn refusal(folder: &Folder, spec: &TrainingSpec) -> TrainError {
+    let (checkpoint, model) = (folder.0.join("c"), folder.0.join("n"));
+    train(&data(), spec, &mut go_on, &checkpoint, &model).unwrap_err()
+}
+
 #[test]
 fn a_network_of_several_steps_estimates_the_end_of_its_window() {
     let folder = Folder::new("several");
@@ -515,17 +521,8 @@ fn a_network_of_several_steps_estimates_the_end_of_its_window() {
         output_steps: Some(0),
         ..spec
     };
-    let refused = train(
-        &data(),
-        &wrong,
-        &mut go_on,
-        &folder.0.join("c"),
-        &folder.0.join("n"),
-    );
-    assert!(
-        matches!(refused, Err(TrainError::NotPositive { .. })),
-        "{refused:?}"
-    );
+    let refused = refusal(&folder, &wrong);
+    assert!(matches!(refused, TrainError::NotPositive { .. }), "{refused:?}");
 }
 
 #[test]
@@ -615,15 +612,6 @@ fn dropout_is_for_training_alone() {
         structure: "TLT".to_owned(),
         ..stronger
     };
-    let refused = train(
-        &data(),
-        &without,
-        &mut go_on,
-        &folder.0.join("c"),
-        &folder.0.join("n"),
-    );
-    assert!(
-        matches!(refused, Err(TrainError::NoDropout { .. })),
-        "{refused:?}"
-    );
+    let refused = refusal(&folder, &without);
+    assert!(matches!(refused, TrainError::NoDropout { .. }), "{refused:?}");
 }

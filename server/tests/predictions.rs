@@ -11,8 +11,9 @@ mod common;
 
 use axum::body::Body;
 use common::Desk;
-use common::models::{register_folder, synthetic};
-use hydroflex_ml::predict::synthetic::signal;
+use common::models::{interval, register_folder, synthetic};
+use hydroflex_ml::predict::PerWindow;
+use hydroflex_ml::predict::synthetic::{SyntheticModel, signal};
 use hydroflex_openapi::catalogue::{AliasInfo, AliasList};
 use hydroflex_openapi::id::ModelId;
 use hydroflex_openapi::inference::{InferError, InferResponse, ModelMetadata, ServerMetadata};
@@ -48,39 +49,43 @@ fn columns(rows: usize) -> Value {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_as_json_gives_estimates_with_intervals_flags_and_provenance() {
+    const ROWS: usize = 400;
     let desk = Desk::new().await;
-    let model = synthetic("best", 1);
-    let id = desk.register(&model).await;
-    let path = format!("/v1/models/{id}/predict");
-    let answer = desk.post(&path, &columns(20).to_string()).await;
-    assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
-    let answer: PredictResponse = answer.json();
-    assert_eq!((answer.first_step, answer.count), (11, 9));
-    assert_eq!(answer.provenance.model_sha256[..32], *id.as_str());
-    let predictor = model.predictor();
-    let mut workspace = predictor.workspace();
-    let mut expected = [0.0; 3];
-    let samples = signal(0, 20);
-    let (lower, upper) = (answer.lower.unwrap(), answer.upper.unwrap());
-    for window in 0..9 {
-        predictor.predict_window(
-            &samples[window * 5..(window + 12) * 5],
-            &mut expected,
-            &mut workspace,
-        );
-        for (target, channel) in model.config.targets.iter().enumerate() {
-            let found = answer.estimates[&channel.name][window];
-            assert!(
-                (found - expected[target]).abs() <= 1e-6 * channel.scale,
-                "{found} {}",
-                expected[target]
-            );
-            let half = predictor.half_width(target, found, None).unwrap();
-            assert!((lower[&channel.name][window] - (found - half)).abs() < 1e-12 * channel.scale.max(1.0));
-            assert!((upper[&channel.name][window] - (found + half)).abs() < 1e-12 * channel.scale.max(1.0));
+    for model in [synthetic("best", 1), synthetic("best", 1).following_payload()] {
+        let id = desk.register(&model).await;
+        let path = format!("/v1/models/{id}/predict");
+        let answer = desk.post(&path, &columns(ROWS).to_string()).await;
+        assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
+        let answer: PredictResponse = answer.json();
+        assert_eq!((answer.first_step, answer.count), (11, ROWS as u64 - 11));
+        assert_eq!(answer.provenance.model_sha256[..32], *id.as_str());
+        let samples = signal(0, ROWS);
+        let (lower, upper) = (answer.lower.unwrap(), answer.upper.unwrap());
+        let mut light = 0;
+        for window in 0..ROWS - 11 {
+            let (expected, payload_kg) = alone(&model, &samples[window * 5..(window + 12) * 5]);
+            light += usize::from(payload_kg.is_some_and(|kg| kg <= 50.0));
+            for (target, channel) in model.config.targets.iter().enumerate() {
+                let found = answer.estimates[&channel.name][window];
+                assert!(
+                    (found - expected[target]).abs() <= 1e-6 * channel.scale,
+                    "{found} {}",
+                    expected[target]
+                );
+                let ends = [&lower, &upper].map(|end| end[&channel.name][window]);
+                let tolerance = 1e-12 * channel.scale.max(1.0);
+                for (end, wanted) in ends.into_iter().zip(interval(&model, target, found, payload_kg)) {
+                    assert!(
+                        (end - wanted).abs() < tolerance,
+                        "window {window}: {end} {wanted}"
+                    );
+                }
+            }
         }
+        // Windows of both widths, or of one.
+        assert_eq!(light > 0 && light < ROWS - 11, model.config.payload.is_some());
+        assert_eq!(answer.inside_envelope.unwrap().len(), ROWS - 11);
     }
-    assert_eq!(answer.inside_envelope.unwrap().len(), 9);
 }
 
 /// A service that lets nothing wait, and one request that takes long.
@@ -189,11 +194,23 @@ fn infer_request(windows: usize) -> (Value, Vec<f64>) {
     (request, samples)
 }
 
-fn expected(model: &hydroflex_ml::predict::synthetic::SyntheticModel, samples: &[f64]) -> Vec<f64> {
+fn expected(model: &SyntheticModel, samples: &[f64]) -> Vec<f64> {
     let predictor = model.predictor();
     let mut out = vec![0.0; samples.len() / 60 * 3];
     predictor.predict_windows(samples, &mut out, &mut predictor.workspace());
     out
+}
+
+/// Estimates and payload of one window by itself.
+fn alone(model: &SyntheticModel, window: &[f64]) -> ([f64; 3], Option<f64>) {
+    let predictor = model.predictor();
+    let (mut estimates, mut payload_kg) = ([0.0; 3], [0.0]);
+    let asked = PerWindow {
+        payload_kg: Some(&mut payload_kg),
+        ..PerWindow::default()
+    };
+    predictor.predict_windows_with(window, &mut estimates, asked, &mut predictor.workspace());
+    (estimates, Some(payload_kg[0]).filter(|kg| !kg.is_nan()))
 }
 
 fn binary(request: &Value, bytes: &[u8]) -> (Vec<u8>, String) {
@@ -201,6 +218,39 @@ fn binary(request: &Value, bytes: &[u8]) -> (Vec<u8>, String) {
     let length = body.len().to_string();
     body.extend(bytes);
     (body, length)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_inference_protocols_intervals_follow_the_payload() {
+    let desk = Desk::new().await;
+    let model = synthetic("best", 1).following_payload();
+    let id = desk.register(&model).await;
+    let (request, samples) = infer_request(60);
+    let answer: InferResponse = desk
+        .post(&format!("/v2/models/{id}/infer"), &request.to_string())
+        .await
+        .json();
+    let numbers = |output: usize| -> Vec<f64> {
+        serde_json::from_value(answer.outputs[output].data.clone().unwrap()).unwrap()
+    };
+    let (lower, upper) = (numbers(1), numbers(2));
+    let mut light = 0;
+    for (window, samples) in samples.chunks(60).enumerate() {
+        let (estimates, payload_kg) = alone(&model, samples);
+        light += usize::from(payload_kg.unwrap() <= 50.0);
+        for (target, estimate) in estimates.into_iter().enumerate() {
+            let wanted = interval(&model, target, estimate, payload_kg);
+            let place = 3 * window + target;
+            let tolerance = 1e-12 * model.config.targets[target].scale.max(1.0);
+            for (end, wanted) in [lower[place], upper[place]].into_iter().zip(wanted) {
+                assert!((end - wanted).abs() < tolerance, "window {window}");
+            }
+        }
+    }
+    assert!(
+        (10..50).contains(&light),
+        "{light} of 60 windows are of light machines"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -9,7 +9,7 @@
 mod common;
 
 use common::Desk;
-use common::models::synthetic;
+use common::models::{interval, synthetic};
 use futures::{SinkExt, StreamExt};
 use hydroflex_ml::predict::synthetic::{SyntheticModel, signal};
 use hydroflex_openapi::stream::{SampleStatus, StreamEstimate, StreamOpened};
@@ -88,14 +88,30 @@ fn truth(model: &SyntheticModel, rows: std::ops::Range<usize>) -> Vec<f64> {
     out
 }
 
+/// Payload that the model tells from the window that ends at this row, kg.
+fn payload_kg(model: &SyntheticModel, row: usize) -> Option<f64> {
+    let samples = signal(row + 1 - STEPS, STEPS);
+    let columns: Vec<Vec<f64>> = (0..5)
+        .map(|i| samples.iter().skip(i).step_by(5).copied().collect())
+        .collect();
+    let views: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+    model
+        .predictor()
+        .predict_series(&views)
+        .payload_kg
+        .first()
+        .copied()
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn each_sample_brings_the_estimate_that_a_recording_gives() {
     let desk = Desk::new().await;
-    let model = synthetic("RLR", 1);
+    let model = synthetic("RLR", 1).following_payload();
     let id = desk.register(&model).await;
     let (mut client, opened) = Client::open(&desk, id.as_str()).await;
     assert_eq!((opened.window_steps, opened.model_id.clone()), (STEPS as u64, id));
-    for row in 0..30 {
+    let mut light = 0;
+    for row in 0..400 {
         let estimate = client.sample(&opened, 100 + row as u64, row, &[]).await;
         assert_eq!((estimate.step, estimate.filled), (100 + row as u64, 0));
         if row + 1 < STEPS {
@@ -106,25 +122,32 @@ async fn each_sample_brings_the_estimate_that_a_recording_gives() {
             continue;
         }
         assert_eq!(estimate.status, SampleStatus::Ok);
+        let payload_kg = payload_kg(&model, row);
+        light += usize::from(payload_kg.unwrap() <= 50.0);
         let truth = truth(&model, row + 1 - STEPS..row + 1);
         for (target, channel) in model.config.targets.iter().enumerate() {
             let found = estimate.estimates.as_ref().unwrap()[&channel.name];
             assert!((found - truth[target]).abs() <= 1e-6 * channel.scale);
-            assert!(estimate.lower.as_ref().unwrap()[&channel.name] < found);
+            let [lower, upper] = interval(&model, target, found, payload_kg);
+            let tolerance = 1e-12 * channel.scale.max(1.0);
+            assert!((estimate.lower.as_ref().unwrap()[&channel.name] - lower).abs() < tolerance);
+            assert!((estimate.upper.as_ref().unwrap()[&channel.name] - upper).abs() < tolerance);
         }
         assert!(estimate.inside_envelope.is_some());
     }
+    assert!((1..300).contains(&light), "{light} windows are of light machines");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bytes_say_the_same_as_text() {
     let desk = Desk::new().await;
-    let model = synthetic("best", 1);
+    let model = synthetic("best", 1).following_payload();
     let id = desk.register(&model).await;
     let (mut client, _) = Client::open(&desk, id.as_str()).await;
-    for row in 0..20 {
+    let mut light = 0;
+    for row in 0..400 {
         let mut frame = (row as u64).to_le_bytes().to_vec();
-        let single = row == 19;
+        let single = row == 399;
         for value in signal(row, 1) {
             if single {
                 frame.extend((value as f32).to_le_bytes());
@@ -148,14 +171,23 @@ async fn bytes_say_the_same_as_text() {
             continue;
         }
         assert_eq!(answer[8], SampleStatus::Ok.code());
+        let payload_kg = payload_kg(&model, row);
+        light += usize::from(payload_kg.unwrap() <= 50.0);
         let truth = truth(&model, row + 1 - STEPS..row + 1);
         for (target, channel) in model.config.targets.iter().enumerate() {
             // The last sample came in single precision.
             let tolerance = if single { 1e-5 } else { 1e-6 } * channel.scale;
             assert!((numbers[3 * target] - truth[target]).abs() <= tolerance);
-            assert!(numbers[3 * target + 1] < numbers[3 * target + 2]);
+            let ends = [numbers[3 * target + 1], numbers[3 * target + 2]];
+            let wanted = interval(&model, target, numbers[3 * target], payload_kg);
+            if !single {
+                for (end, wanted) in ends.into_iter().zip(wanted) {
+                    assert!((end - wanted).abs() < 1e-12 * channel.scale.max(1.0), "row {row}");
+                }
+            }
         }
     }
+    assert!((1..300).contains(&light), "{light} windows are of light machines");
 }
 
 #[tokio::test(flavor = "multi_thread")]

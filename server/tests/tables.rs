@@ -15,7 +15,7 @@ use arrow::compute::concat_batches;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type, Schema};
 use bytes::Bytes;
 use common::Desk;
-use common::models::synthetic;
+use common::models::{interval, synthetic};
 use hydroflex_ml::predict::synthetic::signal;
 use hydroflex_openapi::prediction::PredictResponse;
 use hydroflex_openapi::problem::Problem;
@@ -108,7 +108,7 @@ fn floats<'a>(batch: &'a RecordBatch, name: &str) -> &'a Float64Array {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_table_is_answered_row_by_row_in_any_form() {
     let desk = Desk::new().await;
-    let model = synthetic("best", 1);
+    let model = synthetic("best", 1).following_payload();
     let id = desk.register(&model).await;
     let path = format!("/v1/models/{id}/predict");
     // More rows than are estimated at once, a run shorter than the window, batches cut anywhere.
@@ -195,7 +195,11 @@ async fn a_table_is_answered_row_by_row_in_any_form() {
                             (value - truth).abs() <= 1e-6 * channel.scale,
                             "run {run} step {step}"
                         );
-                        assert!(lower.value(row + step) < value);
+                        let [wanted, _] = interval(&model, target, value, Some(series.payload_kg[k]));
+                        assert!(
+                            (lower.value(row + step) - wanted).abs() <= 1e-6 * channel.scale,
+                            "run {run} step {step}"
+                        );
                     }
                 }
             }

@@ -22,18 +22,61 @@ const FILLED_PAYLOAD_CLASS: usize = 4000;
 /// Fewest windows in a class.
 const SMALLEST_CLASS: usize = 60;
 
-/// Table for one target; absent when there are too few windows.
+/// Table for one target; absent when there are too few windows. `estimate`, `reference` and `centre` in the target's unit, a value per window.
 #[must_use]
 pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalTable> {
-    let mut pairs: Vec<(f64, f64)> = estimate
-        .iter()
-        .zip(reference)
-        .map(|(e, r)| ((e - centre).abs(), (e - r).abs()))
+    by_amplitude(estimate, &errors(estimate, reference), centre)
+}
+
+/// As [`fit`] for a model that tells the payload of each window, kg.
+#[must_use]
+pub fn fit_by_payload(
+    estimate: &[f64],
+    reference: &[f64],
+    payload_kg: &[f64],
+    centre: f64,
+) -> Option<IntervalTable> {
+    let errors = errors(estimate, reference);
+    let classes = (payload_kg.len() / FILLED_PAYLOAD_CLASS).clamp(1, PAYLOAD_CLASSES);
+    let (upper_edges_kg, widths) = in_classes(payload_kg, &errors, classes)?;
+    // An estimator without error in a class: nothing to divide by.
+    let factors = widths.iter().map(|width| width.max(f64::MIN_POSITIVE)).collect();
+    let widths = PayloadWidths {
+        upper_edges_kg,
+        factors,
+    };
+    let in_units: Vec<f64> = (errors.iter().zip(payload_kg))
+        .map(|(error, kg)| error / factor(&widths, *kg))
         .collect();
-    let classes = (pairs.len() / FILLED_CLASS)
+    Some(IntervalTable {
+        payload: Some(widths),
+        ..by_amplitude(estimate, &in_units, centre)?
+    })
+}
+
+fn errors(estimate: &[f64], reference: &[f64]) -> Vec<f64> {
+    let pairs = estimate.iter().zip(reference);
+    pairs.map(|(e, r)| (e - r).abs()).collect()
+}
+
+fn by_amplitude(estimate: &[f64], errors: &[f64], centre: f64) -> Option<IntervalTable> {
+    let amplitudes: Vec<f64> = estimate.iter().map(|e| (e - centre).abs()).collect();
+    let classes = (errors.len() / FILLED_CLASS)
         .clamp(*CLASSES.start(), *CLASSES.end())
-        .min(pairs.len() / SMALLEST_CLASS);
-    if classes == 0 {
+        .min(errors.len() / SMALLEST_CLASS);
+    let (upper_edges, half_widths) = in_classes(&amplitudes, errors, classes)?;
+    Some(IntervalTable {
+        centre,
+        upper_edges,
+        half_widths,
+        payload: None,
+    })
+}
+
+/// Upper edges of classes of equal numbers of windows by `key`, but the last one's, and the half width of each; none without windows or classes.
+fn in_classes(key: &[f64], errors: &[f64], classes: usize) -> Option<(Vec<f64>, Vec<f64>)> {
+    let mut pairs: Vec<(f64, f64)> = key.iter().copied().zip(errors.iter().copied()).collect();
+    if classes == 0 || pairs.len() < classes {
         return None;
     }
     pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -48,54 +91,7 @@ pub fn fit(estimate: &[f64], reference: &[f64], centre: f64) -> Option<IntervalT
             upper_edges.push(pairs[to - 1].0);
         }
     }
-    Some(IntervalTable {
-        centre,
-        upper_edges,
-        half_widths,
-        payload: None,
-    })
-}
-
-/// As [`fit`] for a model that tells the payload of each window, kg.
-#[must_use]
-pub fn fit_by_payload(
-    estimate: &[f64],
-    reference: &[f64],
-    payload_kg: &[f64],
-    centre: f64,
-) -> Option<IntervalTable> {
-    let classes = (payload_kg.len() / FILLED_PAYLOAD_CLASS).clamp(1, PAYLOAD_CLASSES);
-    let mut order: Vec<usize> = (0..payload_kg.len()).collect();
-    order.sort_by(|a, b| payload_kg[*a].total_cmp(&payload_kg[*b]));
-    let mut widths = PayloadWidths {
-        upper_edges_kg: Vec::with_capacity(classes - 1),
-        factors: Vec::with_capacity(classes),
-    };
-    for class in 0..classes {
-        let (from, to) = (class * order.len() / classes, (class + 1) * order.len() / classes);
-        let mut errors: Vec<f64> = order[from..to]
-            .iter()
-            .map(|&window| (estimate[window] - reference[window]).abs())
-            .collect();
-        errors.sort_by(f64::total_cmp);
-        let width = errors.get(rank(errors.len()).checked_sub(1)?).copied()?;
-        widths.factors.push(width.max(f64::MIN_POSITIVE));
-        if class + 1 < classes {
-            widths.upper_edges_kg.push(payload_kg[order[to - 1]]);
-        }
-    }
-    // Every error in units of its class's.
-    let in_units: Vec<f64> = (0..estimate.len())
-        .map(|window| {
-            let unit = factor(&widths, payload_kg[window]);
-            estimate[window] + (reference[window] - estimate[window]) / unit
-        })
-        .collect();
-    let table = fit(estimate, &in_units, centre)?;
-    Some(IntervalTable {
-        payload: Some(widths),
-        ..table
-    })
+    Some((upper_edges, half_widths))
 }
 
 /// Half width around an estimate; absent where a table has no class for it, or wants a payload and gets none.

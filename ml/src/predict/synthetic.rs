@@ -6,7 +6,9 @@ use crate::model::weights::{Auxiliary, LinearWeights, SkipWeights, Weights};
 use crate::model::{ModelError, write};
 use crate::network::init::initial_parameters;
 use crate::structure::{Structure, StructureError};
-use hydroflex_openapi::model::{DenseLayer, GoldenPrediction, ModelConfig};
+use hydroflex_openapi::model::{
+    DenseLayer, EmptyMachine, FollowedPayload, GoldenPrediction, ModelConfig, PayloadWidths, Schedule,
+};
 use serde_json::json;
 use std::path::Path;
 
@@ -95,21 +97,55 @@ impl SyntheticModel {
             envelope: Some(envelope),
         };
         let mut config = config(spec, structure.linear_skip, &layers);
-        let predictor = Predictor::new(&config, &weights, &auxiliary);
-        let mut workspace = predictor.workspace();
-        config.golden = (0..3)
-            .map(|number| {
-                let window = signal(number * spec.window_steps, spec.window_steps);
-                let mut estimates = vec![0.0; spec.targets];
-                predictor.predict_window(&window, &mut estimates, &mut workspace);
-                GoldenPrediction { window, estimates }
-            })
-            .collect();
+        config.golden = golden(&config, &weights, &auxiliary);
         Ok(Self {
             config,
             weights,
             auxiliary,
         })
+    }
+
+    /// The same with a linear part whose coefficients follow the cylinder length and a payload that is estimated twice. Windows whose
+    /// estimate is low, about half of those of [`signal`], have a map of their own, and narrower intervals.
+    #[must_use]
+    pub fn following_payload(mut self) -> Self {
+        let (size, targets) = (self.config.window_steps * INPUTS.len(), self.config.targets.len());
+        let (_, _, length_m, variation_m) = INPUTS[1];
+        let schedule = |exponents: &[&[u32]]| Schedule {
+            inputs: vec![1],
+            centre: vec![length_m],
+            half_range: vec![variation_m],
+            exponents: exponents.iter().map(|e| e.to_vec()).collect(),
+        };
+        let maps = |rows: usize, seed: u64| in_f64(&random(&[map("map", size, rows)], seed).remove(0));
+        let limit_kg = 50.0;
+        let main = schedule(&[&[0, 0], &[1, 0], &[0, 1], &[2, 1], &[0, 3]]);
+        self.weights.skip = Some(maps(main.exponents.len() * targets, 11));
+        self.weights.payload = vec![maps(2, 12), maps(4, 13)];
+        self.weights.empty = Some(maps(2 * targets, 14));
+        self.config.linear_skip = true;
+        self.config.schedule = Some(main);
+        self.config.payload = Some(FollowedPayload {
+            centre_kg: 50.0,
+            half_range_kg: 65.0,
+            estimates: vec![
+                schedule(&[&[0], &[1]]),
+                schedule(&[&[0, 0], &[0, 1], &[1, 1], &[0, 2]]),
+            ],
+            empty: Some(EmptyMachine {
+                below_kg: limit_kg,
+                schedule: schedule(&[&[0], &[1]]),
+                network_gain: [0.25, 1.0, 3.0][..targets].to_vec(),
+            }),
+        });
+        for table in &mut self.config.intervals {
+            table.payload = Some(PayloadWidths {
+                upper_edges_kg: vec![limit_kg],
+                factors: vec![0.5, 2.0],
+            });
+        }
+        self.config.golden = golden(&self.config, &self.weights, &self.auxiliary);
+        self
     }
 
     /// Ready to estimate.
@@ -125,6 +161,20 @@ impl SyntheticModel {
     pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
         write::write_parts(&self.config, &self.weights, &self.auxiliary, &[], folder)
     }
+}
+
+/// Estimates of a few windows of [`signal`].
+fn golden(config: &ModelConfig, weights: &Weights, auxiliary: &Auxiliary) -> Vec<GoldenPrediction> {
+    let predictor = Predictor::new(config, weights, auxiliary);
+    let mut workspace = predictor.workspace();
+    (0..3)
+        .map(|number| {
+            let window = signal(number * config.window_steps, config.window_steps);
+            let mut estimates = vec![0.0; config.targets.len()];
+            predictor.predict_window(&window, &mut estimates, &mut workspace);
+            GoldenPrediction { window, estimates }
+        })
+        .collect()
 }
 
 /// A smooth signal of all inputs: `rows` samples from sample `first` on, row by row.
@@ -241,7 +291,6 @@ mod tests {
     use super::super::sliding::SlidingWindow;
     use super::*;
     use crate::predict::PerWindow;
-    use hydroflex_openapi::model::{EmptyMachine, FollowedPayload, Schedule};
 
     fn model(structure: &str) -> SyntheticModel {
         SyntheticModel::new(&SyntheticSpec {
@@ -426,39 +475,9 @@ mod tests {
         (linear, vec![1.0; targets])
     }
 
-    /// A skip connection whose coefficients follow the second input and a payload that is estimated twice; windows
-    /// whose estimate is low have a map of their own.
+    /// See [`SyntheticModel::following_payload`].
     fn following() -> SyntheticModel {
-        let mut model = scheduled();
-        let schedule = |exponents: &[&[u32]]| Schedule {
-            exponents: exponents.iter().map(|e| e.to_vec()).collect(),
-            ..model.config.schedule.clone().unwrap()
-        };
-        let size = 12 * INPUTS.len();
-        let maps = |rows: usize, seed: u64| {
-            let layer = map("map", size, rows);
-            in_f64(&random(&[layer], seed).remove(0))
-        };
-        let payload = FollowedPayload {
-            centre_kg: 50.0,
-            half_range_kg: 65.0,
-            estimates: vec![
-                schedule(&[&[0], &[1]]),
-                schedule(&[&[0, 0], &[0, 1], &[1, 1], &[0, 2]]),
-            ],
-            empty: Some(EmptyMachine {
-                below_kg: 50.0,
-                schedule: schedule(&[&[0], &[1]]),
-                network_gain: vec![0.25, 1.0, 3.0],
-            }),
-        };
-        let main = schedule(&[&[0, 0], &[1, 0], &[0, 1], &[2, 1], &[0, 3]]);
-        model.weights.skip = Some(maps(5 * 3, 11));
-        model.weights.payload = vec![maps(2, 12), maps(4, 13)];
-        model.weights.empty = Some(maps(2 * 3, 14));
-        model.config.schedule = Some(main);
-        model.config.payload = Some(payload);
-        model
+        model("best").following_payload()
     }
 
     /// A skip connection whose coefficients follow the second input.

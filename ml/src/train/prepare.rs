@@ -112,6 +112,8 @@ pub struct Problem {
     pub steps: usize,
     /// Samples that are estimated at once.
     pub output_steps: usize,
+    /// Samples that the skip takes for each of them.
+    pub skip_steps: usize,
     /// Scales of the inputs.
     pub input_scaling: Scaling,
     /// Scales of the targets.
@@ -362,6 +364,7 @@ impl Problem {
             spec,
             steps,
             output_steps,
+            skip_steps,
             input_scaling,
             target_scaling,
             train,
@@ -432,8 +435,7 @@ impl Problem {
             wanted: Vec::new(),
             targets: self.train.targets.clone(),
         };
-        let skip_steps = self.steps + 1 - self.output_steps;
-        let errors = skip_errors(&part, skip_steps, self.skip.as_ref(), &self.input_scaling);
+        let errors = skip_errors(&part, self.skip_steps, self.skip.as_ref(), &self.input_scaling);
         part.wanted = errors.in_units_of(&self.wanted_scale, &self.empty_gain);
         Some(part)
     }

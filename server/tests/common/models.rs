@@ -19,6 +19,22 @@ pub(crate) fn synthetic(structure: &str, seed: u64) -> SyntheticModel {
     .unwrap()
 }
 
+/// Lower and upper end of the interval around an estimate, as the configuration describes it.
+pub(crate) fn interval(
+    model: &SyntheticModel,
+    target: usize,
+    estimate: f64,
+    payload_kg: Option<f64>,
+) -> [f64; 2] {
+    let table = &model.config.intervals[target];
+    let is_above = |edges: &[f64], value: f64| edges.iter().filter(|edge| **edge < value).count();
+    let mut half = table.half_widths[is_above(&table.upper_edges, (estimate - table.centre).abs())];
+    if let Some(widths) = &table.payload {
+        half *= widths.factors[is_above(&widths.upper_edges_kg, payload_kg.unwrap())];
+    }
+    [estimate - half, estimate + half]
+}
+
 impl Desk {
     /// Registers a model and says how it is addressed.
     pub(crate) async fn register(&self, model: &SyntheticModel) -> ModelId {
